@@ -90,7 +90,7 @@ def test_the_solve_is_that_of_a_twin():
     impulse = friction.own["raft"].impulse["impulse"].numpy()[0][[0, 1, 5]]
     wanted = h * forces(z)[2 * n :]
     np.testing.assert_allclose(impulse, wanted, atol=1e-9 * np.abs(wanted).max())
-    np.testing.assert_allclose(friction.own["raft"].motion["V"].numpy()[0, :2], z[2 * n : 2 * n + 2], rtol=1e-9)
+    np.testing.assert_allclose(friction.own["raft"].arrays["V"].numpy()[0, :2], z[2 * n : 2 * n + 2], rtol=1e-9)
 
 
 @pytest.mark.parametrize("law", [None, {"kind": "power_law", "flow_index": 0.5, "least_shear_rate": 0.1}])

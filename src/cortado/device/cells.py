@@ -13,7 +13,7 @@ import warp as wp
 from cortado.device.grid import Grid
 from cortado.device.launching import launch, launch_together
 from cortado.device.modules import by_name, kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 
 FURTHEST = 2.0**24
 """Greatest distance of a position from the grid [cells]; particles further away count as lost."""
@@ -21,18 +21,10 @@ FURTHEST = 2.0**24
 
 @cache
 def cell_grid_type(precision: Precision) -> Any:
-    vector = precision.vector
-
-    class CellGrid:
-        origin: vector
-        frequency: vector
-        """1 / edge length of a cell [1 / m]."""
-        shape: wp.vec3i
-        starts: wp.array(dtype=wp.int32)
-        """(members cells + 1,): first sorted particle of each cell, scene after scene."""
-
-    CellGrid.__name__ = CellGrid.__qualname__ = f"CellGrid_{precision.name}"
-    return wp.struct(CellGrid)
+    """Return the Warp struct of a grid: ``frequency`` is 1 / edge length of a cell [1 / m], ``starts`` (members cells +
+    1,) the first sorted particle of each cell, scene after scene."""
+    vectors, starts = dict.fromkeys(("origin", "frequency"), precision.vector), wp.array(dtype=wp.int32)
+    return struct_of("CellGrid", precision, **vectors, shape=wp.vec3i, starts=starts)
 
 
 @cache

@@ -73,8 +73,11 @@ def kind_of(forward: bool, taped: bool) -> str:
     return "taped" if taped else "forward"
 
 
+DERIVATIVES = "_derivative_", "_tangent_"
+
+
 def is_derivative(module: Any) -> bool:
-    return "_derivative_" in module.name or "_tangent_" in module.name
+    return any(word in module.name for word in DERIVATIVES)
 
 
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
@@ -86,18 +89,13 @@ class _Said:
     anything = False
 
 
-def compile_ahead(owner: Any, device: Any) -> None:
-    """Compile the modules of the kernels of an object and its parts, except derivatives, once per object."""
+def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
+    """Compile the modules of the kernels of an object and its parts once per object, without tangents, and without
+    ``adjoints`` unless they are wanted."""
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
-        _compile([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)], device)
-
-
-def compile_ahead_adjoint(owner: Any, device: Any) -> None:
-    """Compile the modules of the kernels of an object and its parts, except tangents, once per object."""
-    if _ahead.get(id(owner)) is not owner:
-        _ahead[id(owner)] = owner
-        _compile([kernel for kernel in kernels_of(owner) if "_tangent_" not in kernel.module.name], device)
+        left_out = ("_tangent_",) if adjoints else DERIVATIVES
+        _compile([one for one in kernels_of(owner) if not any(word in one.module.name for word in left_out)], device)
 
 
 def compile_meanwhile(owner: Any, device: Any) -> None:

@@ -8,7 +8,7 @@ CPU and Warp's tape have a single lane.
 """
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
@@ -51,6 +51,10 @@ class Precision:
         """Warp type of 3 x 3 matrices."""
         return wp.types.matrix(shape=(3, 3), dtype=self.real)
 
+    def vector_of(self, values: Iterable[float]) -> Any:
+        """Return a Warp vector of two or three components; in 2-D z is 0."""
+        return self.vector(*(*values, 0.0)[:3])
+
     def fractions(self, phases: int) -> Any:
         """Return the Warp vector type with a number for each phase."""
         return wp.types.vector(length=phases, dtype=self.real)
@@ -66,6 +70,11 @@ def precision_named(name: str) -> Precision:
         if isinstance(name, str) and precision.name == name:
             return precision
     raise InputError(f'precision is {shown(name)}, but must be "float32" or "float64".')
+
+
+def struct_of(name: str, precision: Precision, **fields: Any) -> Any:
+    """Return the Warp struct of a name and a precision with fields of these types."""
+    return wp.struct(type(f"{name}_{precision.name}", (), {"__annotations__": fields, "__module__": __name__}))
 
 
 class TypesByName:

@@ -121,13 +121,14 @@ class CentreOfMass:
         return float((self._miss(end) ** 2).sum())
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        bar = 2.0 * _shares(self._weights, end)[:, None] * self._miss(end)
+        bar = 2.0 * self._shares(end)[:, None] * self._miss(end)
         return self.value(end), (bar, np.zeros_like(end.velocities))
 
+    def _shares(self, end: Snapshot) -> np.ndarray:
+        return _shares(self._weights, end, "target", self.target)
+
     def _miss(self, end: Snapshot) -> np.ndarray:
-        if self.target.shape != (end.dimension,):
-            raise InputError(f"target has shape {self.target.shape}, but must be {(end.dimension,)}.")
-        return _shares(self._weights, end) @ end.positions - self.target
+        return self._shares(end) @ end.positions - self.target
 
 
 @fixed
@@ -149,9 +150,7 @@ class CentreOfMassAlong:
         return self.value(end), (self._slopes(end), np.zeros_like(end.velocities))
 
     def _slopes(self, end: Snapshot) -> np.ndarray:
-        if self.direction.shape != (end.dimension,):
-            raise InputError(f"direction has shape {self.direction.shape}, but must be {(end.dimension,)}.")
-        return _shares(self._weights, end)[:, None] * self.direction
+        return _shares(self._weights, end, "direction", self.direction)[:, None] * self.direction
 
 
 def _finite(what: str, value: Any) -> np.ndarray:
@@ -171,9 +170,11 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
     return array
 
 
-def _shares(weights: np.ndarray | None, end: Snapshot) -> np.ndarray:
-    """Return the particles' masses (n,) divided by the total mass."""
+def _shares(weights: np.ndarray | None, end: Snapshot, name: str, vector: np.ndarray) -> np.ndarray:
+    """Return the particles' masses (n,) divided by the total mass; raise `InputError` for an unfit vector of a loss."""
     n = len(end.positions)
+    if vector.shape != (end.dimension,):
+        raise InputError(f"{name} has shape {vector.shape}, but must be {(end.dimension,)}.")
     if weights is None:
         return np.full(n, 1.0 / n)
     if weights.shape != (n,):

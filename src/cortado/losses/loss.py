@@ -1,7 +1,7 @@
 """Protocols of losses for a scene and for a batch, the states that losses read, adjoints, and sums of losses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol, overload, runtime_checkable
 
@@ -25,8 +25,37 @@ def precision_of(state: State) -> Precision:
     return FLOAT64 if state.positions.dtype == FLOAT64.vector else FLOAT32
 
 
+class OnHost:
+    """The arrays of a state of one scene or of a batch, which are copied from the device on first use."""
+
+    state: State
+
+    @property
+    def precision(self) -> Precision:
+        """The precision of the Warp arrays."""
+        return precision_of(self.state)
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """Positions of the particles, (n, d) [m], in a batch (batch, n, d), float64, read-only."""
+        return self._field("positions")
+
+    @cached_property
+    def velocities(self) -> np.ndarray:
+        """Velocities of the particles, (n, d) [m / s], in a batch (batch, n, d), float64, read-only."""
+        return self._field("velocities")
+
+    @cached_property
+    def mass_fractions(self) -> np.ndarray:
+        """Mass fractions of the particles, (n, phases) [-], in a batch (batch, n, phases), float64, read-only."""
+        return self._field("mass_fractions")
+
+    def _field(self, name: str) -> np.ndarray:
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class Snapshot:
+class Snapshot(OnHost):
     """A state of a rollout, usually the last one, as NumPy and Warp arrays in the scene's order."""
 
     state: State
@@ -39,26 +68,6 @@ class Snapshot:
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
-
-    @property
-    def precision(self) -> Precision:
-        """The precision of the Warp arrays."""
-        return precision_of(self.state)
-
-    @cached_property
-    def positions(self) -> np.ndarray:
-        """Positions of the particles, (n, d) [m], float64, read-only."""
-        return self._field("positions")
-
-    @cached_property
-    def velocities(self) -> np.ndarray:
-        """Velocities of the particles, (n, d) [m / s], float64, read-only."""
-        return self._field("velocities")
-
-    @cached_property
-    def mass_fractions(self) -> np.ndarray:
-        """Mass fractions of the particles, (n, phases) [-], float64, read-only."""
-        return self._field("mass_fractions")
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return by name a field of the state ("velocities"), a quantity of its particles ("density", "pressure"), or
@@ -234,7 +243,7 @@ def fingerprint(loss: Any) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class SnapshotBatch(Sequence[Snapshot]):
+class SnapshotBatch(OnHost, Sequence[Snapshot]):
     """A state of a batch's rollout; ``end[b]`` is the `Snapshot` of scene b."""
 
     state: State
@@ -265,30 +274,13 @@ class SnapshotBatch(Sequence[Snapshot]):
         own = self.state.member(number), self.dimension, self.colours[number], self.moment
         return _Member(*own, batch=self, number=number)
 
-    @property
-    def precision(self) -> Precision:
-        """The precision of the Warp arrays."""
-        return precision_of(self.state)
-
-    @property
-    def positions(self) -> np.ndarray:
-        """Positions of the particles, (batch, n, d) [m], float64, read-only."""
-        return self.on_host["positions"]
-
-    @property
-    def velocities(self) -> np.ndarray:
-        """Velocities of the particles, (batch, n, d) [m / s], float64, read-only."""
-        return self.on_host["velocities"]
-
-    @property
-    def mass_fractions(self) -> np.ndarray:
-        """Mass fractions of the particles, (batch, n, phases) [-], float64, read-only."""
-        return self.on_host["mass_fractions"]
-
     @cached_property
     def on_host(self) -> dict[str, np.ndarray]:
         """All fields of all scenes by name, copied from the device together; float64, read-only."""
         return {name: _read_only(array) for name, array in self.state.numpy(self.dimension).items()}
+
+    def _field(self, name: str) -> np.ndarray:
+        return self.on_host[name]
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -316,42 +308,3 @@ class BatchedLoss(Protocol):
         """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays:
         ``end.state.like()`` makes a state of zeros, and the state's ``set({"positions": array})`` fills it from an
         array (batch, n, d)."""
-
-
-def batch_values(loss: Loss, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
-    """Return the losses (batch,), NaN for scenes outside ``members``."""
-    found = np.full(len(end), np.nan)
-    if isinstance(loss, BatchedLoss):
-        found[members] = loss.values(end)[members]
-    else:
-        found[members] = [loss.value(end[b]) for b in members]
-    return found
-
-
-def batch_values_and_adjoints(
-    loss: Loss, end: SnapshotBatch, members: Sequence[int]
-) -> tuple[np.ndarray, SnapshotAdjoint]:
-    """Return the losses (batch,) and the states' adjoints, NaN and 0 for scenes outside ``members``."""
-    found = np.full(len(end), np.nan)
-    if isinstance(loss, BatchedLoss):
-        all_found, state = loss.values_and_adjoint(end)
-        found[members] = all_found[members]
-        for b in set(range(len(end))).difference(members):
-            state.member(b).clear()
-        return found, SnapshotAdjoint(state, np.zeros_like(end.colours))
-    adjoint = SnapshotAdjoint(end.state.like(), np.zeros_like(end.colours))
-    arrays: dict[str, np.ndarray] = {}
-    for b in members:
-        found[b], bar = loss.value_and_adjoint(end[b])
-        more: Mapping[str, np.ndarray] = {}
-        if isinstance(bar, SnapshotAdjoint):
-            adjoint.colours[b], more, bar = bar.colours, bar.quantities, bar.state
-        if isinstance(bar, State):
-            adjoint.state.member(b).assign(bar)
-        else:
-            more = by_field(bar, end.dimension)
-        for name, array in more.items():
-            arrays.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
-    adjoint.state.set(arrays)
-    of_quantities = {name: array for name, array in arrays.items() if name not in end.state.names}
-    return found, replace(adjoint, quantities=of_quantities)

@@ -15,13 +15,10 @@ from cortado.losses.loss import (
     Adjoint,
     BatchedLoss,
     Frames,
-    Loss,
     Snapshot,
     SnapshotAdjoint,
     SnapshotBatch,
     bar_on_device,
-    batch_values,
-    batch_values_and_adjoints,
     moment_of,
 )
 from cortado.particles.state import State
@@ -98,6 +95,23 @@ class CheckedLoss:
         value, bar = self._loss.value_and_adjoint(end)
         return as_one_number("the loss's value", value), self._checked(bar, end)
 
+    def values(self, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
+        """Return the losses (batch,), NaN for scenes outside ``members``."""
+        return _among(members, [self.value(end[b]) for b in members], len(end))
+
+    def values_and_adjoints(self, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
+        """Return the `values` and the states' adjoints, 0 for scenes outside ``members``."""
+        found, state, colours = np.full(len(end), np.nan), end.state.like(), np.zeros_like(end.colours)
+        quantities: dict[str, np.ndarray] = {}
+        for b in members:
+            found[b], given = self.value_and_adjoint(end[b])
+            bar = bar_on_device(given, end[b])
+            state.member(b).assign(bar.state)
+            colours[b] = bar.colours
+            for name, array in bar.quantities.items():
+                quantities.setdefault(name, np.zeros((len(end), *array.shape)))[b] = array
+        return found, SnapshotAdjoint(state, colours, quantities)
+
     def _checked(self, bar: Any, end: Snapshot) -> Adjoint:
         if isinstance(bar, State):
             return _checked_state(bar, end)
@@ -118,15 +132,25 @@ class CheckedLoss:
 
 
 class CheckedBatchedLoss(CheckedLoss):
-    def values(self, end: SnapshotBatch) -> np.ndarray:
-        return _checked_array("values", self._loss.values(end), (len(end),))
+    def values(self, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
+        found = _checked_array("values", self._loss.values(end), (len(end),))
+        return _among(members, found[members], len(end))
 
-    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+    def values_and_adjoints(self, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
         values, bar = self._loss.values_and_adjoint(end)
-        return _checked_array("values", values, (len(end),)), _checked_state(bar, end)
+        found, state = _checked_array("values", values, (len(end),)), _checked_state(bar, end)
+        for b in set(range(len(end))).difference(members):
+            state.member(b).clear()
+        return _among(members, found[members], len(end)), SnapshotAdjoint(state, np.zeros_like(end.colours))
 
 
-def as_loss(loss: Any) -> Loss:
+def _among(members: Sequence[int], values: Any, batch: int) -> np.ndarray:
+    found = np.full(batch, np.nan)
+    found[members] = values
+    return found
+
+
+def as_loss(loss: Any) -> CheckedLoss:
     """Wrap a loss, or a function of Warp arrays, with checks of results; raise `InputError` for anything else."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object of this class.")
@@ -180,7 +204,7 @@ def _layout(array: wp.array) -> str:
     return f"a Warp array of {wp.types.type_repr(array.dtype)} of shape {array.shape} on {array.device}"
 
 
-class LossesByStep(dict[int, Loss]):
+class LossesByStep(dict[int, CheckedLoss]):
     """The losses of a run by the number of steps before the state."""
 
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
@@ -213,18 +237,22 @@ class LossesByStep(dict[int, Loss]):
         """Return the sum of the losses, given states by number of steps; for a batch (batch,), NaN for scenes outside
         ``going``, which is None for a single scene."""
         self._check(ends)
-        if going is None:
-            return sum(loss.value(ends[step]) for step, loss in self.items())
-        return sum(batch_values(loss, ends[step], going) for step, loss in self.items())
+        return sum(
+            loss.value(ends[step]) if going is None else loss.values(ends[step], going) for step, loss in self.items()
+        )
 
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
         """Return the `total` of the losses, and the states' adjoints by number of steps."""
         self._check(ends)
-        if going is None:
-            one = {step: loss.value_and_adjoint(ends[step]) for step, loss in self.items()}
-            bars = {step: bar_on_device(bar, ends[step]) for step, (_, bar) in one.items()}
-            return sum(value for value, _ in one.values()), bars
-        each = {step: batch_values_and_adjoints(loss, ends[step], going) for step, loss in self.items()}
-        return sum(values for values, _ in each.values()), {step: bar for step, (_, bar) in each.items()}
+        total: Any = 0.0
+        bars = {}
+        for step, loss in self.items():
+            if going is None:
+                value, bar = loss.value_and_adjoint(ends[step])
+                total, bars[step] = total + value, bar_on_device(bar, ends[step])
+            else:
+                values, bars[step] = loss.values_and_adjoints(ends[step], going)
+                total = total + values
+        return total, bars

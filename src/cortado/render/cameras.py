@@ -275,8 +275,7 @@ class Calibration:
     """Unknown numbers of a view as parameters, starting from an approximate (``aimed``) view.
 
     The parameters are "translation" (3,) [m] and "rotation" (3,) [rad] of the camera, its "field_of_view" [degrees] or,
-    with
-    parallel rays, "width" [m], and the "extinction" of the fluid [1/m].
+    with parallel rays, "width" [m], and the "extinction" of the fluid [1/m].
     """
 
     aimed: View

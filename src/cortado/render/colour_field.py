@@ -10,6 +10,7 @@ particle's images count like the particle. The sums are gathers: a node sums ove
 adjoint a particle sums over the nodes within its support.
 """
 
+from collections.abc import Mapping
 from functools import cache, cached_property, partial
 from math import prod
 from typing import Any
@@ -21,10 +22,9 @@ from cortado.device.cells import CellSort, cell_functions, cell_grid_type
 from cortado.device.grid import Grid
 from cortado.device.launching import launch
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.device.reduction import sum_of
 from cortado.device.threads import field_parts, require
-from cortado.discretise.smoothing import SmoothingKernel
 from cortado.discretise.smoothing_functions import smoothing_functions
 from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation
@@ -43,28 +43,12 @@ def rgba_type(precision: Precision) -> Any:
 
 @cache
 def nodes_type(precision: Precision) -> Any:
-    """Return the Warp struct of a regular grid of nodes; arrays over nodes are [z, y, x]."""
+    """Return the Warp struct of a regular grid of nodes, ``cell`` [m] apart; arrays over nodes are [z, y, x].
+    ``frequency`` is 1 / cell, ``period`` that of each axis [m], 0 or greater than two supports, and ``turn`` 1 / period
+    or 0. ``images`` is the number of periodic images of a particle, along each axis, whose support can reach nodes."""
     real, vector = precision.real, precision.vector
-
-    class Nodes:
-        origin: vector
-        """First node [m]."""
-        cell: real
-        """Distance of neighbouring nodes [m]."""
-        frequency: real
-        """1 / cell [1 / m]."""
-        shape: wp.vec3i
-        """Along x, y, z."""
-        periodic: wp.int32
-        period: vector
-        """Period of each axis [m], greater than two supports; 0 along an axis that is not periodic."""
-        turn: vector
-        """1 / period [1 / m], or 0."""
-        images: wp.vec3i
-        """Number of periodic images of a particle, along each axis, whose support can reach nodes."""
-
-    Nodes.__name__ = Nodes.__qualname__ = f"Nodes_{precision.name}"
-    return wp.struct(Nodes)
+    sizes, periods = {"cell": real, "frequency": real, "shape": wp.vec3i}, {"period": vector, "turn": vector}
+    return struct_of("Nodes", precision, origin=vector, **sizes, periodic=wp.int32, **periods, images=wp.vec3i)
 
 
 @cache
@@ -110,7 +94,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
     colours_matrix = colours_type(precision, phases)
     module = kernel_module(f"phase_colour_{phases}_{precision.name}")
 
-    kinds = {colours_matrix: "colours", wp.int32: "order", vector: "x colour", fractions: "c"}
+    kinds = {colours_matrix: "colours", wp.int32: "order", vector: "x colour tint", fractions: "c"}
     typed = TypesByName(precision.real, kinds)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -131,11 +115,11 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def phase_colour_adjoint(colours, c_scene, colour_scene_bar, c_scene_bar, colours_bar):
+    def phase_colour_adjoint(colours, c_scene, tint_scene_bar, c_scene_bar, colours_bar):
         """Compute the adjoint of the mass fractions and, for each particle, its part of the adjoint of the phase
         colours."""
         j = wp.tid()
-        bar = colour_scene_bar[j]
+        bar = tint_scene_bar[j]
         c_scene_bar[j] = colours[0] * bar
         colours_bar[j] = wp.outer(c_scene[j], bar)
 
@@ -154,7 +138,8 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     place, nearest, image = node_functions(precision)
     module, fields = discretisation.module(False, "colour_field"), wp.array3d(dtype=rgba)
 
-    typed = TypesByName(real, {vector: "x colour", nodes_struct: "nodes", grid_type: "grid"})
+    kinds = {vector: "x colour tint", nodes_struct: "nodes", grid_type: "grid", wp.int32: "order", fields: "field"}
+    typed = TypesByName(real, kinds)
 
     @wp.func
     @typed
@@ -174,7 +159,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
-    def colour_field(nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, field: fields):
+    def colour_field(nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, field):
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         c = cell_of(x_g, grid)
@@ -190,7 +175,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def colour_field_tangent(
-        nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, x_dot, colour_dot, field_dot: fields
+        nodes, grid, h: real, per_h: real, sigma: real, volume: real, x, colour, x_dot, colour_dot, field_dot
     ):
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
@@ -219,17 +204,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def colour_field_adjoint(
-        nodes,
-        h: real,
-        per_h: real,
-        sigma: real,
-        volume: real,
-        order: wp.array(dtype=wp.int32),
-        x,
-        colour,
-        field_bar: wp.array3d(dtype=rgba),
-        x_scene_bar,
-        colour_scene_bar,
+        nodes, h: real, per_h: real, sigma: real, volume: real, order, x, colour, field_bar, x_scene_bar, tint_scene_bar
     ):
         p = wp.tid()
         x_p = x[p]
@@ -249,7 +224,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
                             rgba_bar += weight(x_gq, per_h, sigma) * bar
                             x_bar += -wp.dot(bar, rgba_p) * gradient(x_gq, per_h, sigma)
         x_scene_bar[order[p]] = volume * x_bar
-        colour_scene_bar[order[p]] = volume * vector(rgba_bar[0], rgba_bar[1], rgba_bar[2])
+        tint_scene_bar[order[p]] = volume * vector(rgba_bar[0], rgba_bar[1], rgba_bar[2])
 
     return Kernels(colour_field, colour_field_tangent, colour_field_adjoint)
 
@@ -267,13 +242,13 @@ def nodes_over(
         )
     flat = 3 - len(lower)
     nodes = nodes_type(precision)()
-    nodes.origin = precision.vector(*(lower - margin * cell), *[0.0] * flat)
+    nodes.origin = precision.vector_of(lower - margin * cell)
     nodes.cell, nodes.frequency = cell, 1.0 / cell
     nodes.shape = wp.vec3i(*(int(n) for n in counts), *[1] * flat)
     turns = np.divide(1.0, periods, out=np.zeros(len(periods)), where=periods > 0.0)
     images = np.floor((cell * (counts - 1) + 2 * support) * turns) + 1
     nodes.periodic = int(periods.any())
-    nodes.period, nodes.turn = (precision.vector(*values, *[0.0] * flat) for values in (periods, turns))
+    nodes.period, nodes.turn = map(precision.vector_of, (periods, turns))
     nodes.images = wp.vec3i(*(int(n) for n in images), *[1] * flat)
     return nodes
 
@@ -281,34 +256,18 @@ def nodes_over(
 class ColourField:
     """A map from a fixed number of particles to a field on a grid; `adjoint` overwrites its last result."""
 
-    def __init__(
-        self,
-        lower: np.ndarray,
-        upper: np.ndarray,
-        periods: np.ndarray,
-        cell: float,
-        smoothing: SmoothingKernel,
-        support: float,
-        volume: float,
-        particles: int,
-        phases: int,
-        precision: Precision,
-        device: Any,
-    ):
-        """Allocate for particles in a region (d,) to (d,) [m]; arguments are those of the `Renderer`."""
-        self._particles = particles
+    def __init__(self, of: Mapping[str, Any], precision: Precision, device: Any):
+        """Allocate for the particles and the region ``of`` the arguments of a `Renderer`."""
+        particles, phases, support, smoothing = (of[name] for name in ("particles", "phases", "support", "smoothing"))
+        lower, upper, periods = (np.array(of[name]) for name in ("lower", "upper", "periods"))
+        self._particles, self._device, self._precision = particles, device, precision
         self._tint = phase_colour_kernels(precision, phases)
         self._field = colour_field_kernels(Discretisation(smoothing, precision))
-        self._device, self._precision = device, precision
-        grid = Grid.around(lower, upper, periods, support, MOST_CELLS)
-        self._sort = CellSort(grid, particles, precision, device)
+        self._sort = CellSort(Grid.around(lower, upper, periods, support, MOST_CELLS), particles, precision, device)
         sigma = smoothing.normalisation(len(lower), support)
-        self._kernel = {"h": support, "per_h": 1.0 / support, "sigma": sigma, "volume": volume}
-        zeros, mix, palette = (
-            partial(wp.zeros, device=device),
-            precision.fractions(phases),
-            colours_type(precision, phases),
-        )
+        self._kernel = {"h": support, "per_h": 1.0 / support, "sigma": sigma, "volume": of["volume"]}
+        zeros, mix = partial(wp.zeros, device=device), precision.fractions(phases)
+        palette = colours_type(precision, phases)
         vectors = (zeros(particles, dtype=precision.vector) for _ in range(4))
         self._x, self._x_bar, self._colour, self._colour_bar = vectors
         self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
@@ -316,7 +275,7 @@ class ColourField:
         self._colours_bar = zeros(particles, dtype=palette)
         self._known = {"order": self._sort.order, "colours": self._colours, "c_scene": self._fractions}
         self._sum = sum_of(palette, particles, device)
-        self.nodes = nodes_over(lower, upper, periods, cell, support, precision)
+        self.nodes = nodes_over(lower, upper, periods, of["cell"], support, precision)
         require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
         self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=rgba_type(precision))
         """(nz, ny, nx) colour times coverage, and coverage [-]."""
@@ -351,7 +310,7 @@ class ColourField:
         """Return derivatives with respect to positions (n,), fractions (n,) and colours (phases, 3), given that with
         respect to the field."""
         own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
-        bars = {"x_scene_bar": self._x_bar, "colour_scene_bar": self._colour_bar}
+        bars = {"x_scene_bar": self._x_bar, "tint_scene_bar": self._colour_bar}
         bars |= {"c_scene_bar": self._fractions_bar, "colours_bar": self._colours_bar}
         launch(self._field.adjoint, self._particles, self._device, self._kernel, self._known, own, bars)
         launch(self._tint.adjoint, self._particles, self._device, self._known, bars)

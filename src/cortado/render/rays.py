@@ -14,50 +14,27 @@ from typing import Any
 
 import warp as wp
 
-from cortado.device.precision import Precision
+from cortado.device.precision import Precision, struct_of
 from cortado.render.colour_field import nodes_type, rgba_type
 
 
 @cache
 def camera_type(precision: Precision) -> Any:
-    real, vector = precision.real, precision.vector
-    matrix = wp.types.matrix(shape=(3, 3), dtype=real)
-
-    class Camera:
-        position: vector
-        """[m]"""
-        orientation: matrix
-        """Columns: right, up and backwards."""
-        half_width: real
-        """Half of the visible width at the camera [m]."""
-        growth: real
-        """Growth of the half width with depth [-]."""
-        columns: wp.int32
-        rows: wp.int32
-        near: real
-        """Distance along a ray at which samples begin [m]."""
-        step: real
-        """Distance of neighbouring samples [m]."""
-        samples: wp.int32
-
-    Camera.__name__ = Camera.__qualname__ = f"Camera_{precision.name}"
-    return wp.struct(Camera)
+    """Return the Warp struct of a camera: the columns of ``orientation`` point right, up and backwards; ``half_width``
+    [m] is seen at the camera, ``growth`` [-] is its growth with depth; samples begin at the distance ``near`` [m] along
+    a ray and are ``step`` apart [m]."""
+    real, pixels = precision.real, {"columns": wp.int32, "rows": wp.int32}
+    pose, widths = {"position": precision.vector, "orientation": precision.matrix}, {"half_width": real, "growth": real}
+    ray = {"near": real, "step": real, "samples": wp.int32}
+    return struct_of("Camera", precision, **pose, **widths, **pixels, **ray)
 
 
 @cache
 def camera_tangent_type(precision: Precision) -> Any:
     """Return the Warp struct of a view's change; see `cortado.render.cameras.ViewTangent`."""
-    real, vector = precision.real, precision.vector
-
-    class CameraTangent:
-        position: vector
-        turn: vector
-        half_width: real
-        growth: real
-        thickness: real
-
-    CameraTangent.__name__ = CameraTangent.__qualname__ = f"CameraTangent_{precision.name}"
-    return wp.struct(CameraTangent)
+    vectors = dict.fromkeys(("position", "turn"), precision.vector)
+    numbers = dict.fromkeys(("half_width", "growth", "thickness"), precision.real)
+    return struct_of("CameraTangent", precision, **vectors, **numbers)
 
 
 @cache

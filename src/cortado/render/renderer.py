@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
@@ -20,7 +20,6 @@ from cortado.render.absorption import RayMarcher
 from cortado.render.cameras import Perspective, TopView, View, ViewTangent, Volume, positive, vector
 from cortado.render.colour_field import ColourField
 from cortado.scene.appearance import Render
-from cortado.scene.discrete_scene import Lattice
 from cortado.scene.scene import Scene
 from cortado.scene.tables import sentences
 
@@ -95,27 +94,12 @@ class Renderer:
                 f"{2.0 * support:g} m."
             )
         own_colours = None if colours is None else _of_shape("colours", colours, (phases, 3)).copy()
-        self.view = view
-        self._settings: dict[str, Any] = {
-            "lower": tuple(low),
-            "upper": tuple(high),
-            "smoothing": smoothing,
-            "support": support,
-            "volume": volume,
-            "particles": particles,
-            "phases": phases,
-            "device": device,
-            "dimension": dimension,
-            "cell": cell,
-            "periods": tuple(turns),
-            "colours": own_colours,
-        }
-        self._particles, self._phases, self._precision = particles, phases, precision
-        self._dimension, self._device = dimension, wp.get_device(device)
-        self._colours = own_colours
-        self._field = ColourField(
-            low, high, turns, cell, smoothing, support, volume, particles, phases, precision, self._device
-        )
+        own: dict[str, Any] = {"lower": tuple(low), "upper": tuple(high), "smoothing": smoothing, "support": support}
+        own |= {"volume": volume, "particles": particles, "phases": phases, "device": wp.get_device(device).alias}
+        self._settings = own | {"dimension": dimension, "cell": cell, "periods": tuple(turns), "colours": own_colours}
+        self.view, self._precision, self._device = view, precision, wp.get_device(device)
+        self._particles, self._phases, self._dimension, self._colours = particles, phases, dimension, own_colours
+        self._field = ColourField(self._settings, precision, self._device)
         self._rays = RayMarcher(view, self._field.nodes, precision, self._device)
         self._rendered = False
 
@@ -125,8 +109,7 @@ class Renderer:
         return f"Renderer({view}, {columns} x {rows} pixels, {counted(self._particles, 'particle')})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        settings = {**self._settings, "device": self._device.alias}
-        return _made_again, (self.view, settings, self._precision.name)
+        return _made_again, (self.view, self._settings, self._precision.name)
 
     @property
     def fingerprint(self) -> str:
@@ -286,51 +269,24 @@ CAMERA = ("position", "look_at", "field_of_view", "extinction")
 """Keys of the table [render] that are specific to one view."""
 
 
-class Pictured(Protocol):
-    """The parts of a `cortado.Simulation` that its renderer uses."""
-
-    scene: Scene
-    positions: np.ndarray
-    particles: int
-    precision: Precision
-    device: Any
-    smoothing: SmoothingKernel
-    lattice: Lattice
-
-    @property
-    def dimension(self) -> int:
-        """2 or 3."""
-
-
-def scene_renderer(simulation: Pictured, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """Make a renderer for a simulation's particles from its scene's table [render]; without the table, a view from
-    above.
+def scene_renderer(simulation: Any, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
+    """Make a renderer for the particles of a `cortado.Simulation` from its scene's table [render]; without the table, a
+    view from above.
 
     The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
     `Simulation.renderer`.
     """
-    scene = simulation.scene
-    ends, x = scene.container.extent(), simulation.positions
+    scene, dimension, x = simulation.scene, simulation.dimension, simulation.positions
+    cut, ends = scene.discretisation, scene.container.extent()
     lower, upper = (x.min(axis=0), x.max(axis=0)) if ends is None else ends
-    dimension = simulation.dimension
-    cell = scene.discretisation.spacing * FINENESS[dimension]
-    table = _table(scene, settings)
-    return Renderer(
-        _view(table, lower, upper, scene.discretisation.spacing, cell, extinction_factor),
-        lower,
-        upper,
-        smoothing=simulation.smoothing,
-        support=scene.discretisation.support_radius,
-        volume=simulation.lattice.cell,
-        particles=simulation.particles,
-        phases=len(scene.phase),
-        precision=simulation.precision,
-        device=simulation.device,
-        dimension=dimension,
-        cell=cell,
-        periods=scene.container.periods(dimension)[1],
-        colours=np.array([phase.colour for phase in scene.phase]),
-    )
+    cell = cut.spacing * FINENESS[dimension]
+    own: dict[str, Any] = {"smoothing": simulation.smoothing, "support": cut.support_radius, "dimension": dimension}
+    own |= {"volume": simulation.lattice.cell, "particles": simulation.particles, "phases": len(scene.phase)}
+    own |= {"precision": simulation.precision, "device": simulation.device, "cell": cell}
+    own |= {"periods": scene.container.periods(dimension)[1]}
+    own |= {"colours": np.array([phase.colour for phase in scene.phase])}
+    view = _view(_table(scene, settings), lower, upper, cut.spacing, cell, extinction_factor)
+    return Renderer(view, lower, upper, **own)
 
 
 def _table(scene: Scene, settings: dict[str, Any]) -> Render:

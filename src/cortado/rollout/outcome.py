@@ -9,7 +9,7 @@ from cortado.rollout.rollout import Rollout
 from cortado.scene.drain_tables import flow_name
 from cortado.scene.emitter_table import emitted_name
 from cortado.scene.scene import Scene
-from cortado.sph.viscous_stress import Solve
+from cortado.sph.viscous_solve import Solve
 
 TORN = 0.015
 """Greatest divergence, times the step, without a warning; stable flows reach 0.014."""

@@ -16,7 +16,7 @@ import warp as wp
 
 from cortado.calls import Staying
 from cortado.device.launching import CapturedGraph
-from cortado.device.modules import compile_ahead, compile_ahead_adjoint
+from cortado.device.modules import compile_ahead
 from cortado.device.reduction import add
 from cortado.device.threads import WARP, Turn, in_turn, require, step_parts, within
 from cortado.errors import DivergedError, InputError
@@ -296,7 +296,7 @@ class Rollout(Staying):
         self._require("backward", self._kept)
         self.solver.set_substeps(self.substeps)
         if self.steps > 0:
-            compile_ahead_adjoint(derivative, self._device)
+            compile_ahead(derivative, self._device, adjoints=True)
         derivative.begin()
         self._forget_stale_graphs()
         if self.steps in bars:

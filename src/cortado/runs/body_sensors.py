@@ -48,11 +48,12 @@ class SpringLoads:
         layout, self._springs, self._spring = springs.layout, springs, spring
         self._threads, self._bars = layout.members, PoseBars(springs)
         self._widen, self._narrow = six_kernels(layout.precision)
-        self._at = {name: wp.zeros(layout.members, **springs.vectors) for name in ("reading", "reading_bar")}
+        vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
+        self._at = {name: wp.zeros(**vectors) for name in ("reading", "reading_bar")}
         self._load = wp.zeros(layout.members, dtype=SIX, device=layout.device)
 
     def _known(self, step: StepContext) -> tuple[Named, ...]:
-        return numbers_of(step.parameters, self._spring.name, NUMBERS), *self._springs.poses(self._spring)
+        return numbers_of(step.parameters, self._spring.name, NUMBERS), *self._springs.known(self._spring)
 
     def _found(self, step: StepContext, kernel: Any, found: str, *more: Named) -> wp.array:
         out = {found: self._at["reading"]}

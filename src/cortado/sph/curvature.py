@@ -62,11 +62,6 @@ class CurvatureConstants:
         return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))
 
 
-def _indicator(size: np.ndarray) -> np.ndarray:
-    t = np.clip((size - FAINT) / (CLEAR - FAINT), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
 @cache
 def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[int, int]) -> float:
     """Return J of a surface cut across a direction in the plane of the first two axes, for a support in spacings."""
@@ -80,7 +75,8 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
     inside, place = above >= 0, np.clip(above, 0, 2 * layers)
     g = np.append((inside * slopes).sum(axis=1), np.zeros(layers + 1))
     q = (inside * weights * g[place]).sum(axis=1) / (inside * weights).sum(axis=1)
-    return float((_indicator(np.abs(q)) * np.abs(q)).sum() * apart)
+    t = np.clip((np.abs(q) - FAINT) / (CLEAR - FAINT), 0.0, 1.0)
+    return float((t * t * (3.0 - 2.0 * t) * np.abs(q)).sum() * apart)
 
 
 FAINT, CLEAR = 0.03, 0.1

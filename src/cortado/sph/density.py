@@ -200,10 +200,6 @@ class WallSums:
     def adjoint(
         self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array, *groups: Named
     ) -> None:
-        step.launch(self.term.kernels.adjoint, {self.term.bar: total_bar}, *groups, *bar.named, self._known(solid))
-        self.give(step, bar, solid, total_bar, *groups)
-
-    def give(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, *groups: Named) -> None:
-        given = {self.term.bar: total_bar}
-        kernel, factors = self.term.solid_kernel, self._constants
-        bar.solids.add(step.launch, kernel, given, *groups, *bar.named, constants=factors, over=solid)
+        known = {self.term.bar: total_bar}, *groups, *bar.named
+        step.launch(self.term.kernels.adjoint, *known, self._known(solid))
+        bar.solids.add(step.launch, self.term.solid_kernel, *known, constants=self._constants, over=solid)

@@ -26,21 +26,11 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.device.reduction import TreeReduction
 from cortado.discretise.shapes import Points
 from cortado.particles.particle_kernels import particle_kernel, pointwise_kernels
-from cortado.particles.state import (
-    POSITIONS,
-    VELOCITIES,
-    Entry,
-    Layout,
-    Parameters,
-    State,
-    StateField,
-    padded,
-    to_device,
-)
+from cortado.particles.state import POSITIONS, VELOCITIES, Entry, Layout, Parameters, State, StateField, to_device
 from cortado.scene.drain_tables import count_name
 from cortado.scene.emitter_table import again_name, emitted_name
 from cortado.scene.parameters import Axis
@@ -97,22 +87,11 @@ class Drained:
 
 @cache
 def mouth_type(precision: Precision) -> Any:
+    """Return the Warp struct of a drain: ``lower`` and ``upper`` are corners of a box from its middle [m], ``lower`` is
+    the direction of a plane; ``period`` [m] and its inverse ``frequency`` are 0 along an axis that is not periodic."""
     real, vector = precision.real, precision.vector
-
-    class MouthOf:
-        shape: wp.int32
-        number: real
-        lower: vector
-        """Lower corner of a box from its middle [m]; the direction of a plane."""
-        upper: vector
-        radius: real
-        period: vector
-        """[m], 0 along an axis that is not periodic."""
-        frequency: vector
-        """1 / period [1 / m], or 0."""
-
-    MouthOf.__name__ = MouthOf.__qualname__ = f"MouthOf_{precision.name}"
-    return wp.struct(MouthOf)
+    ends, periods = {"lower": vector, "upper": vector}, {"period": vector, "frequency": vector}
+    return struct_of("MouthOf", precision, shape=wp.int32, number=real, **ends, radius=real, **periods)
 
 
 @cache
@@ -184,15 +163,14 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
 
 
 def _period(periods: Points, precision: Precision) -> dict[str, Any]:
-    lengths = padded(periods[None])[0]
-    frequency = np.divide(1.0, lengths, out=np.zeros(3), where=lengths > 0.0)
-    return {"period": precision.vector(*lengths), "frequency": precision.vector(*frequency)}
+    frequency = np.divide(1.0, periods, out=np.zeros(len(periods)), where=periods > 0.0)
+    return {"period": precision.vector_of(periods), "frequency": precision.vector_of(frequency)}
 
 
 def _mouth(one: Mouth, number: int, periods: Points, precision: Precision) -> Any:
     found = mouth_type(precision)()
     found.shape, found.number, found.radius = one.shape, float(number + 1), one.radius
-    found.lower, found.upper = (precision.vector(*padded(end[None])[0]) for end in one.ends)
+    found.lower, found.upper = map(precision.vector_of, one.ends)
     for name, vector in _period(periods, precision).items():
         setattr(found, name, vector)
     return found
@@ -214,30 +192,18 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
 
         @typed
         def drive(
-            time_step,
-            flow,
-            position,
-            x_i,
-            v_i,
-            kick_i,
-            acceleration_in_i,
-            inner,
-            outer,
-            sphere,
-            power,
-            period,
-            frequency,
+            time_step, flow, position, x_i, v_i, kick_i, acceleration_in_i, inner, outer, area, power, period, frequency
         ) -> vector:
             y = nearest(x_i - position, period, frequency)
             r = wp.sqrt(wp.dot(y, y) + tiny)
             t = wp.clamp((outer - r) / (outer - inner), no, one)
             phi = t * t * t * (real(10.0) - t * (real(15.0) - real(6.0) * t))
-            goal = -flow / (sphere * wp.pow(wp.max(r, real(0.1) * inner), power)) * y - memory * kick_i
+            goal = -flow / (area * wp.pow(wp.max(r, real(0.1) * inner), power)) * y - memory * kick_i
             return acceleration_in_i + phi * ((goal - v_i) / time_step - acceleration_in_i)
 
         return drive
 
-    numbers = ["inner", "outer", "sphere", "power", "period", "frequency"]
+    numbers = ["inner", "outer", "area", "power", "period", "frequency"]
     drives = pointwise_kernels(
         precision, modules, make, ["acceleration"], {"acceleration": "acceleration_in"}, numbers=numbers
     )
@@ -273,10 +239,29 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
     return tally, fall_behind, drives, Kernels(read, read, add_to)
 
 
+class DrainsTangent(PartTangent):
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        both = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
+        step.launch(self.part.parks.tangent, both, self.part.taken, x_of=both["x_dot"], v_of=both["v_dot"])
+
+
+class DrainsAdjoint(PartAdjoint):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        self._free = part.free.like()
+
+    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
+        free = {"x_free_bar": self._free.positions, "v_free_bar": self._free.velocities}
+        moved = {"x_of": moved_bar.positions, "v_of": moved_bar.velocities}
+        step.launch(self.part.parks.adjoint, free, moved, self.part.taken)
+        return self._free
+
+
 class Drains(Part):
     """The part of a step that removes particles, and the force of sinks, after all other forces."""
 
     batches = is_last = True
+    derivatives = DrainsTangent, DrainsAdjoint
 
     def __init__(self, of: Drained, layout: Layout, taped: bool):
         self.layout, precision, device, real = layout, layout.precision, layout.device, layout.precision.real
@@ -318,7 +303,7 @@ class Drains(Part):
         return to_device(np.tile(one.middle, (self.layout.members, 1)), self.layout.precision, self.layout.device)
 
     def _pull(self, pull: Pull, periods: Points) -> dict[str, Any]:
-        own = {"inner": pull.shell[0], "outer": pull.shell[1], "sphere": pull.sphere, "holds": pull.holds}
+        own = {"inner": pull.shell[0], "outer": pull.shell[1], "area": pull.sphere, "holds": pull.holds}
         return {**own, "power": float(len(periods)), **_period(periods, self.layout.precision)}
 
     def begin(self, step: StepContext, state: State) -> None:
@@ -351,12 +336,6 @@ class Drains(Part):
         wp.copy(state["drained"], self.taken["taken"])
         for name, count in self._counts.items():
             wp.copy(state[name], count)
-
-    def new_tangent(self) -> "DrainsTangent":
-        return DrainsTangent(self)
-
-    def new_adjoint(self) -> "DrainsAdjoint":
-        return DrainsAdjoint(self)
 
     def _known(self, step: StepContext, name: str) -> tuple[Named, ...]:
         of = self._of(step.parameters, name)
@@ -402,23 +381,3 @@ class Drains(Part):
             rates = self._of(bar.parameters, name)
             step.launch(self.flows.adjoint, rates, total=self._sum(flow_bar), threads=self.layout.members)
         return passed
-
-
-class DrainsTangent(PartTangent):
-    def __init__(self, of: Drains):
-        self._of = of
-
-    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        both = {"x_dot": state_dot.positions, "v_dot": state_dot.velocities}
-        step.launch(self._of.parks.tangent, both, self._of.taken, x_of=both["x_dot"], v_of=both["v_dot"])
-
-
-class DrainsAdjoint(PartAdjoint):
-    def __init__(self, of: Drains):
-        self._of, self._free = of, of.free.like()
-
-    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        free = {"x_free_bar": self._free.positions, "v_free_bar": self._free.velocities}
-        moved = {"x_of": moved_bar.positions, "v_of": moved_bar.velocities}
-        step.launch(self._of.parks.adjoint, free, moved, self._of.taken)
-        return self._free

@@ -21,19 +21,9 @@ import numpy as np
 import warp as wp
 
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.particles.particle_kernels import particle_kernel
-from cortado.particles.state import (
-    POSITIONS,
-    VELOCITIES,
-    Entry,
-    Layout,
-    Parameters,
-    State,
-    StateField,
-    padded,
-    to_device,
-)
+from cortado.particles.state import POSITIONS, VELOCITIES, Entry, Layout, Parameters, State, StateField, to_device
 from cortado.scene.emitter_table import EmitterSample, again_name, emitted_name, outlet_name, path_name
 from cortado.scene.parameters import Axis
 from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tangents, integration_module
@@ -41,25 +31,13 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
+    """Return the Warp struct of a nozzle: its particles, u as ``upstream``, o as ``offsets``, e as ``direction`` and A
+    as ``area``; lengths in m."""
     real, vector = precision.real, precision.vector
-
-    class Nozzle:
-        first: wp.int32
-        count: wp.int32
-        layer: wp.int32
-        upstream: wp.array(dtype=real)
-        """u [m]"""
-        offsets: wp.array(dtype=vector)
-        """o [m]"""
-        direction: vector
-        """e"""
-        column: real
-        spacing: wp.float64
-        area: real
-        """A [m^(d - 1)]"""
-
-    Nozzle.__name__ = Nozzle.__qualname__ = f"Nozzle_{precision.name}"
-    return wp.struct(Nozzle)
+    particles = dict.fromkeys(("first", "count", "layer"), wp.int32)
+    arrays = {"upstream": wp.array(dtype=real), "offsets": wp.array(dtype=vector)}
+    sizes = {"direction": vector, "column": real, "spacing": wp.float64, "area": real}
+    return struct_of("Nozzle", precision, **particles, **arrays, **sizes)
 
 
 @cache
@@ -89,8 +67,8 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
     module, derivatives = (integration_module(precision, *one, topic="emitter") for one in ((True, taped), (False,)))
     numbers, remaining = ["nozzle", "particles"], remaining_function(precision)
     own = {nozzle_of: "nozzle", wp.array2d(dtype=vector): "path", wp.array2d(dtype=real): "flow"}
-    own |= {wp.int32: "step", wp.float64: "emitted serial"}
-    typed = TypesByName(real, {vector: "outlet drift x v", **own})
+    own |= {wp.int32: "i member particles step", wp.float64: "emitted serial", wp.array(dtype=vector): "places"}
+    typed = TypesByName(real, {vector: "outlet q drift x v", **own})
 
     @wp.func
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
@@ -98,73 +76,40 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
 
     @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"])
     @typed
-    def begin(
-        i: int, nozzle, path, flow, step_i, time_step_i, outlet_in_i, emitted_in_i
-    ) -> tuple[vector, vector, wp.float64]:
+    def begin(i, nozzle, path, flow, step_i, time_step_i, q_in_i, emitted_in_i) -> tuple[vector, vector, wp.float64]:
         q, flow_rate = path[i, step_i], flow[i, step_i]
-        drift = (q - outlet_in_i) / time_step_i + (flow_rate / nozzle.area) * nozzle.direction
+        drift = (q - q_in_i) / time_step_i + (flow_rate / nozzle.area) * nozzle.direction
         return q, drift, emitted_in_i + advance(flow_rate, nozzle.area, time_step_i)
 
     @particle_kernel(derivatives, "outlet_dot drift_dot emitted_dot", numbers=["nozzle"])
     @typed
     def begin_tangent(
-        i: int,
-        nozzle,
-        path_dot,
-        flow,
-        flow_dot,
-        step_i,
-        time_step_i,
-        time_step_dot_i,
-        drift_i,
-        outlet_in_dot_i,
-        emitted_in_dot_i,
+        i, nozzle, path_dot, flow, flow_dot, step_i, time_step_i, time_step_dot_i, drift_i, q_in_dot_i, emitted_in_dot_i
     ) -> tuple[vector, vector, wp.float64]:
         q_dot, along = path_dot[i, step_i], nozzle.direction / nozzle.area
         flow_rate, flow_rate_dot = flow[i, step_i], flow_dot[i, step_i]
         turn = drift_i - flow_rate * along
-        drift_dot = (q_dot - outlet_in_dot_i - time_step_dot_i * turn) / time_step_i + flow_rate_dot * along
+        drift_dot = (q_dot - q_in_dot_i - time_step_dot_i * turn) / time_step_i + flow_rate_dot * along
         faster = advance(flow_rate_dot, nozzle.area, time_step_i)
         return q_dot, drift_dot, emitted_in_dot_i + faster + advance(flow_rate, nozzle.area, time_step_dot_i)
 
     @particle_kernel(derivatives, "outlet_bar emitted_bar +time_step_bar", numbers=["nozzle"])
     @typed
     def begin_adjoint(
-        i: int,
-        nozzle,
-        path_bar,
-        flow,
-        flow_bar,
-        step_i,
-        time_step_i,
-        drift_i,
-        x_total_i,
-        v_total_i,
-        outlet_bar_i,
-        emitted_bar_i,
+        i, nozzle, path_bar, flow, flow_bar, step_i, time_step_i, drift_i, x_sum_i, v_sum_i, outlet_bar_i, emitted_bar_i
     ) -> tuple[vector, wp.float64, real]:
-        path_bar[i, step_i] = path_bar[i, step_i] + outlet_bar_i + x_total_i + v_total_i / time_step_i
-        along, whole = nozzle.direction / nozzle.area, emitted_bar_i + wp.float64(wp.dot(nozzle.direction, x_total_i))
+        path_bar[i, step_i] = path_bar[i, step_i] + outlet_bar_i + x_sum_i + v_sum_i / time_step_i
+        along, whole = nozzle.direction / nozzle.area, emitted_bar_i + wp.float64(wp.dot(nozzle.direction, x_sum_i))
         flow_rate = flow[i, step_i]
         further, turn = real(whole) / nozzle.area, drift_i - flow_rate * along
-        faster, longer = wp.dot(along, v_total_i), -wp.dot(v_total_i, turn) / time_step_i
+        faster, longer = wp.dot(along, v_sum_i), -wp.dot(v_sum_i, turn) / time_step_i
         flow_bar[i, step_i] = flow_bar[i, step_i] + further * time_step_i + faster
-        return -v_total_i / time_step_i, whole, further * flow_rate + longer
+        return -v_sum_i / time_step_i, whole, further * flow_rate + longer
 
     @particle_kernel(module, "x v", numbers=numbers)
     @typed
     def prescribe(
-        i: int,
-        member: int,
-        particles: int,
-        nozzle,
-        outlet,
-        drift,
-        emitted,
-        places: wp.array(dtype=vector),
-        serial_i,
-        x_free_i,
-        v_free_i,
+        i, member, particles, nozzle, outlet, drift, emitted, places, serial_i, x_free_i, v_free_i
     ) -> tuple[vector, vector]:
         p = i - member * particles
         s, x, v = remaining(p, nozzle, serial_i, emitted), x_free_i, v_free_i
@@ -182,17 +127,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
     @particle_kernel(derivatives, "x_dot v_dot", numbers=numbers)
     @typed
     def prescribe_tangent(
-        i: int,
-        member: int,
-        particles: int,
-        nozzle,
-        emitted,
-        outlet_dot,
-        drift_dot,
-        emitted_dot,
-        serial_i,
-        x_dot_i,
-        v_dot_i,
+        i, member, particles, nozzle, emitted, outlet_dot, drift_dot, emitted_dot, serial_i, x_dot_i, v_dot_i
     ) -> tuple[vector, vector]:
         s, no = remaining(i - member * particles, nozzle, serial_i, emitted), vector()
         if s > nozzle.column:
@@ -204,7 +139,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
     @particle_kernel(derivatives, "x_free_bar v_free_bar x_prescribed_bar v_prescribed_bar", numbers=numbers)
     @typed
     def prescribe_adjoint(
-        i: int, member: int, particles: int, nozzle, emitted, serial_i, x_bar_i, v_bar_i
+        i, member, particles, nozzle, emitted, serial_i, x_bar_i, v_bar_i
     ) -> tuple[vector, vector, vector, vector]:
         s, no = remaining(i - member * particles, nozzle, serial_i, emitted), vector()
         led, free = s > real(0.0) and s <= nozzle.column, s <= real(0.0)
@@ -221,13 +156,12 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
     their places in line. ``before`` counts the marked particles before each."""
     real, nozzle_of, remaining = precision.real, nozzle_type(precision), remaining_function(precision)
     module = integration_module(precision, True, taped, "emitter")
-    typed = TypesByName(real, {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "held before"})
+    numbers = {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "i member particles"}
+    typed = TypesByName(real, {**numbers, wp.array(dtype=wp.int32): "held before", wp.array(dtype=wp.bool): "drains"})
 
     @particle_kernel(module, "held", numbers=["nozzle", "particles"])
     @typed
-    def hold(
-        i: int, member: int, particles: int, nozzle, emitted_in, drains: wp.array(dtype=wp.bool), drained_i, serial_i
-    ) -> wp.int32:
+    def hold(i, member, particles, nozzle, emitted_in, drains, drained_i, serial_i) -> wp.int32:
         in_line = remaining(i - member * particles, nozzle, serial_i, emitted_in) > real(0.0)
         return wp.where(drains[int(drained_i)] and not in_line, 1, 0)
 
@@ -237,17 +171,7 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
 
     @particle_kernel(module, "serial", numbers=["nozzle", "particles"])
     @typed
-    def join(
-        i: int,
-        member: int,
-        particles: int,
-        nozzle,
-        emitted_in,
-        emitted,
-        held: wp.array(dtype=wp.int32),
-        before: wp.array(dtype=wp.int32),
-        serial_in_i,
-    ) -> wp.float64:
+    def join(i, member, particles, nozzle, emitted_in, emitted, held, before, serial_in_i) -> wp.float64:
         layer = wp.float64(nozzle.layer)
         first = wp.max(layers(nozzle, emitted_in), wp.float64(nozzle.count) / layer)
         rank = wp.float64(before[i] - before[member * particles])
@@ -285,12 +209,53 @@ class Nozzle:
         constants.upstream = wp.array(sample.upstream, dtype=precision.real, device=device)
         constants.offsets = to_device(sample.offsets, precision, device)
         constants.column = sample.column
-        constants.direction = precision.vector(*padded(self.direction[None])[0])
+        constants.direction = precision.vector_of(self.direction)
         return constants
+
+
+class EmitterTangent(PartTangent):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        known = {f"{name}_dot": part.constants[name] for name in ("outlet", "drift", "emitted")}
+        self._dot = {name: wp.zeros_like(array, requires_grad=False) for name, array in known.items()}
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        emitter, name = self.part, self.part.nozzle.name
+        known = emitter.constants, self._dot, emitter.parameters(step.parameters)
+        before = {"q_in_dot": state_dot[outlet_name(name)], "emitted_in_dot": state_dot[emitted_name(name)]}
+        before |= emitter.parameters(dot.parameters, "_dot") | {"time_step_dot": dot.parameters["time_step"]}
+        step.launch(emitter.begins.tangent, *known, **before, threads=emitter.layout.members)
+        step.launch(emitter.ends.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
+        wp.copy(state_dot[outlet_name(name)], self._dot["outlet_dot"])
+        wp.copy(state_dot[emitted_name(name)], self._dot["emitted_dot"])
+
+
+class EmitterAdjoint(PartAdjoint):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        self._free, self._prescribed = part.free.like(), part.free.like()
+        self._sums = [part.layout.sum_of(part.layout.precision.vector) for _ in range(2)]
+
+    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
+        """Return the adjoint of free particles; add that of prescribed ones to ``bar`` and the nozzle's adjoint."""
+        emitter, free, prescribed = self.part, self._free, self._prescribed
+        parts = {"x_free_bar": free.positions, "v_free_bar": free.velocities}
+        parts |= {"x_prescribed_bar": prescribed.positions, "v_prescribed_bar": prescribed.velocities}
+        bars = {"x_bar": moved_bar.positions, "v_bar": moved_bar.velocities}
+        step.launch(emitter.ends.adjoint, emitter.constants, bars, parts)
+        x_sum, v_sum = (add_up(x) for add_up, x in zip(self._sums, prescribed.arrays(), strict=True))
+        name, known = emitter.nozzle.name, (emitter.constants, emitter.parameters(step.parameters))
+        own = {"outlet_bar": state_bar[outlet_name(name)], "emitted_bar": state_bar[emitted_name(name)]}
+        collected = {**own, "x_sum": x_sum, "v_sum": v_sum, "time_step_bar": bar["time_step"]}
+        collected |= emitter.parameters(bar, "_bar")
+        step.launch(emitter.begins.adjoint, *known, **collected, threads=emitter.layout.members)
+        return free
 
 
 class Emitter(Part):
     """The part of a step that prescribes the particles waiting in a nozzle."""
+
+    derivatives = EmitterTangent, EmitterAdjoint
 
     def __init__(self, nozzle: Nozzle, layout: Layout, requires_grad: bool = False):
         self.nozzle, self.layout, name = nozzle, layout, nozzle.name
@@ -323,18 +288,15 @@ class Emitter(Part):
     def begin(self, step: StepContext, state: State) -> None:
         """Compute the column's motion from the state before the step, which `end` may overwrite."""
         name = self.nozzle.name
-        before = {"outlet_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
+        before = {"q_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
         known = self.constants, self.parameters(step.parameters)
         step.launch(self.begins.forward, *known, **before, threads=self.layout.members)
         if self.nozzle.feeding.any():
-            self._feed(step, before, state)
-
-    def _feed(self, step: StepContext, before: dict[str, wp.array], state: State) -> None:
-        held, joined = self.feeds
-        known = {**self.constants, **before, **self._pool, "serial_in": state[again_name(self.nozzle.name)]}
-        step.launch(held, {**known, "serial": known["serial_in"]}, drained=state["drained"])
-        wp.utils.array_scan(self._pool["held"], self._pool["before"], inclusive=False)
-        step.launch(joined, known)
+            held, joined = self.feeds
+            feeding = {**self.constants, **before, **self._pool, "serial_in": state[again_name(name)]}
+            step.launch(held, {**feeding, "serial": feeding["serial_in"]}, drained=state["drained"])
+            wp.utils.array_scan(self._pool["held"], self._pool["before"], inclusive=False)
+            step.launch(joined, feeding)
 
     def target(self, moved: State) -> State:
         return self.free
@@ -344,52 +306,3 @@ class Emitter(Part):
         step.launch(self.ends.forward, self.constants, **free, x=moved.positions, v=moved.velocities)
         for field in self.fields:
             wp.copy(state[field.name], self.own[field.name])
-
-    def new_tangent(self) -> "EmitterTangent":
-        return EmitterTangent(self)
-
-    def new_adjoint(self) -> "EmitterAdjoint":
-        return EmitterAdjoint(self)
-
-
-class EmitterTangent(PartTangent):
-    def __init__(self, emitter: Emitter):
-        self._emitter = emitter
-        known = emitter.constants
-        self._dot = {
-            f"{name}_dot": wp.zeros_like(known[name], requires_grad=False) for name in ("outlet", "drift", "emitted")
-        }
-
-    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        emitter, name = self._emitter, self._emitter.nozzle.name
-        known = emitter.constants, self._dot, emitter.parameters(step.parameters)
-        before = {"outlet_in_dot": state_dot[outlet_name(name)], "emitted_in_dot": state_dot[emitted_name(name)]}
-        before |= emitter.parameters(dot.parameters, "_dot") | {"time_step_dot": dot.parameters["time_step"]}
-        step.launch(emitter.begins.tangent, *known, **before, threads=emitter.layout.members)
-        step.launch(emitter.ends.tangent, *known, x_dot=state_dot.positions, v_dot=state_dot.velocities)
-        wp.copy(state_dot[outlet_name(name)], self._dot["outlet_dot"])
-        wp.copy(state_dot[emitted_name(name)], self._dot["emitted_dot"])
-
-
-class EmitterAdjoint(PartAdjoint):
-    def __init__(self, emitter: Emitter):
-        self._emitter = emitter
-        self._free = emitter.free.like()
-        self._prescribed = emitter.free.like()
-        layout = emitter.layout
-        self._sums = [layout.sum_of(layout.precision.vector) for _ in range(2)]
-
-    def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Return the adjoint of free particles; add that of prescribed ones to ``bar`` and the nozzle's adjoint."""
-        emitter, free, prescribed = self._emitter, self._free, self._prescribed
-        parts = {"x_free_bar": free.positions, "v_free_bar": free.velocities}
-        parts |= {"x_prescribed_bar": prescribed.positions, "v_prescribed_bar": prescribed.velocities}
-        bars = {"x_bar": moved_bar.positions, "v_bar": moved_bar.velocities}
-        step.launch(emitter.ends.adjoint, emitter.constants, bars, parts)
-        x_total, v_total = (add_up(x) for add_up, x in zip(self._sums, prescribed.arrays(), strict=True))
-        name, known = emitter.nozzle.name, (emitter.constants, emitter.parameters(step.parameters))
-        own = {"outlet_bar": state_bar[outlet_name(name)], "emitted_bar": state_bar[emitted_name(name)]}
-        collected = {**own, "x_total": x_total, "v_total": v_total, "time_step_bar": bar["time_step"]}
-        collected |= emitter.parameters(bar, "_bar")
-        step.launch(emitter.begins.adjoint, *known, **collected, threads=emitter.layout.members)
-        return free

@@ -5,7 +5,7 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import prod
 from tempfile import TemporaryFile
@@ -18,61 +18,9 @@ import warp as wp
 from cortado.device.modules import c_stderr_to
 from cortado.device.precision import Precision
 from cortado.errors import InputError
-from cortado.particles.state import Layout, Parameters, components
-from cortado.scene.parameters import Axis, Parameter
-from cortado.sph.function_meaning import (
-    FRACTIONS,
-    PLACE,
-    READ,
-    READ_OF,
-    REAL,
-    VECTOR,
-    InPrecision,
-    check_calls,
-    check_helper,
-    check_truths,
-    meanings,
-)
-from cortado.sph.function_text import DerivativeCheck, Frozen, SizesWritten, check_names, check_returns, definition
-from cortado.sph.own_arrays import MOST_NUMBERS, WIDTH, Numbers, reading, table_type
-from cortado.sph.parts import Adjoints, StepContext
-
-
-class Packed:
-    """The parameters of a user's function as one vector theta for every scene, with tangent and adjoint."""
-
-    def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
-        own = [one for one in parameters if one.axis is not Axis.ARRAY]
-        self._numbers, members = Numbers(own, layout, taped), layout.members
-        self.dtype = theta_of(layout.precision, [one.rank for one in own])
-        options = {"dtype": self.dtype, "device": layout.device}
-        self._theta = wp.zeros(members, **options, requires_grad=taped)
-        self._theta_dot = wp.zeros(members, **options)
-        self.shares = wp.zeros(layout.all_particles, **options)
-        """(n,) each particle's term of the adjoint of theta in a step."""
-        self._sum = layout.sum_of(self.dtype) if own else None
-
-    def theta(self, step: StepContext) -> wp.array:
-        return self._packed(step, step.parameters, self._theta)
-
-    def theta_dot(self, step: StepContext, parameters_dot: Parameters) -> wp.array:
-        return self._packed(step, parameters_dot, self._theta_dot)
-
-    def collect(self, step: StepContext, bar: Adjoints) -> None:
-        if self._sum is not None:
-            self._numbers.add(step, self._table(self._sum(self.shares)), bar.parameters)
-
-    def _packed(self, step: StepContext, values: Parameters, theta: wp.array) -> wp.array:
-        self._numbers.pack(step, values, self._table(theta))
-        return theta
-
-    def _table(self, theta: wp.array) -> wp.array:
-        return components(theta, (len(theta), self.dtype._length_))
-
-
-def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
-    """Return the Warp vector type of parameters of these ranks, with at least one number."""
-    return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
+from cortado.sph.function_meaning import FRACTIONS, PLACE, READ, READ_OF, REAL, VECTOR, meanings, text_for_warp
+from cortado.sph.function_text import Frozen, SizesWritten, definition
+from cortado.sph.own_arrays import MOST_NUMBERS, reading, table_type, theta_of
 
 
 @dataclass(frozen=True)
@@ -84,7 +32,7 @@ class Inputs:
 
 
 TIME = "t", "time"
-MOST_TURNS, MOST_AXES = 256, 3
+MOST_AXES = 3
 TYPES = re.compile(r"'[^']*' \(aka '[^']*'\)")
 INPUTS = {
     "Body": Inputs(("x", "v"), fields=("density", FRACTIONS, "shear_rate", "velocity_gradient"), arrays=True),
@@ -160,19 +108,7 @@ def formula(
     fields = taken[len(inputs) :]
     shapes = _shapes(what, function, values, INPUTS[kind])
     frozen, written = Frozen(what, function), SizesWritten(shapes).visit(definition(what, function, source))
-    for helper in frozen.helpers:
-        tree = helper.adj.tree
-        DerivativeCheck(what).visit(tree)
-        check_helper(what, tree.body[0])
-    DerivativeCheck(what, MOST_TURNS).visit(written)
-    local = {node.id for node in ast.walk(written) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
-    own = {*taken, *values, *local}
-    check_returns(what, written, INPUTS[kind].kind)
-    check_names(what, written, own, frozen.scope)
-    check_calls(what, written, own, frozen.scope)
-    check_truths(what, written)
-    rewritten = InPrecision(what, frozen.scope, own, shapes).visit(ast.Module([written], []))
-    text = ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
+    text = text_for_warp(what, written, frozen, shapes, INPUTS[kind].kind)
     scope = MappingProxyType(frozen.scope)
     numbers = tuple(name for name in values if name not in shapes)
     names = (inputs, fields, INPUTS[kind].kind, numbers, tuple(shapes))

@@ -246,12 +246,7 @@ MOST_SUBSTEPS = 10_000
 
 
 def stable_substeps(
-    scene: Scene,
-    free_energy: FreeEnergy,
-    time_step: float,
-    mobility: float,
-    interface_width: float,
-    rest_density: np.ndarray,
+    scene: Scene, energy: FreeEnergy, time_step: float, mobility: float, width: float, densities: np.ndarray
 ) -> int:
     """Return the number of stable substeps of diffusion in a time step [s], given a mobility [m2/s], an interface width
     [m] and rest densities (phases,) [kg/m3]. The length of a substep is at most
@@ -262,11 +257,11 @@ def stable_substeps(
     times as heavy, a light one diffuses up to (1 + ratio) / 2 times as fast. Raise `OutOfRangeError` for more than
     `MOST_SUBSTEPS`.
     """
-    mixture, cut, densities = scene.mixture, scene.discretisation, rest_density
+    mixture, cut = scene.mixture, scene.discretisation
     rate = laplacian_rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension)
     rate *= 0.5 * (1.0 + float(np.max(densities) / np.min(densities)))
     greatest = mobility * MOBILITIES[mixture.mobility_form].greatest(len(scene.phase))
-    speed = greatest * rate * (interface_width**2 * rate + mixture.strength * free_energy.curvature)
+    speed = greatest * rate * (width**2 * rate + mixture.strength * energy.curvature)
     limit = 2.0 * SAFETY / speed if speed > 0.0 else np.inf
     number = float(np.ceil(time_step / limit))
     if number > MOST_SUBSTEPS:
@@ -312,53 +307,40 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
             result[k] = u[k] - mean
         return result
 
-    typed = TypesByName(real, {fractions: "total c chi", neighbourhood: "s", vector: "x"})
+    typed = TypesByName(real, {fractions: "B c chi", neighbourhood: "s", vector: "x"})
 
-    @particle_kernel(module, "chi w", [over(spread, "total", **of_c)], numbers=["strength"])
+    @particle_kernel(module, "chi w", [over(spread, "B", **of_c)], numbers=["strength"])
     @typed
-    def potential(total, strength, interface_width, mobility, m_i, c_i, s) -> tuple[fractions, real]:
+    def potential(B, strength, interface_width, mobility, m_i, c_i, s) -> tuple[fractions, real]:
         stiffness = interface_width * interface_width * s.volume / m_i
-        return strength * project(energy_gradient(c_i)) - stiffness * total, m_i * mobility * mobile(c_i)
+        return strength * project(energy_gradient(c_i)) - stiffness * B, m_i * mobility * mobile(c_i)
 
-    @particle_kernel(module, "c_new", [over(spread, "total", **of_chi)], numbers=["substeps"])
+    @particle_kernel(module, "c_new", [over(spread, "B", **of_chi)], numbers=["substeps"])
     @typed
-    def flux(total, substeps: int, time_step, m_i, c_i, s) -> fractions:
-        return c_i + (time_step / real(substeps) * s.volume / m_i) * total
+    def flux(B, substeps: int, time_step, m_i, c_i, s) -> fractions:
+        return c_i + (time_step / real(substeps) * s.volume / m_i) * B
 
-    both = [over(spread, "total", **of_c), over(spread_tangent, "total_dot", **of_c, **dotted(of_c))]
+    both = [over(spread, "B", **of_c), over(spread_tangent, "B_dot", **of_c, **dotted(of_c))]
 
     @particle_kernel(tangent_module, "chi_dot w_dot", both, numbers=["strength"])
     @typed
     def potential_tangent(
-        total,
-        total_dot,
-        strength,
-        interface_width,
-        interface_width_dot,
-        mobility,
-        mobility_dot,
-        m_i,
-        m_dot_i,
-        c_i,
-        c_dot_i,
-        s,
+        B, B_dot, strength, interface_width, interface_width_dot, mobility, mobility_dot, m_i, m_dot_i, c_i, c_dot_i, s
     ) -> tuple[fractions, real]:
         scale = s.volume / m_i
         stiffness = interface_width * interface_width * scale
         stiffness_dot = real(2.0) * interface_width * interface_width_dot * scale - stiffness * m_dot_i / m_i
-        chi_dot = (
-            strength * project(energy_hessian_product(c_i, c_dot_i)) - stiffness * total_dot - stiffness_dot * total
-        )
+        chi_dot = strength * project(energy_hessian_product(c_i, c_dot_i)) - stiffness * B_dot - stiffness_dot * B
         by_m = (m_dot_i * mobility + m_i * mobility_dot) * mobile(c_i)
         return chi_dot, by_m + m_i * mobility * wp.dot(mobile_gradient(c_i), c_dot_i)
 
-    both = [over(spread, "total", **of_chi), over(spread_tangent, "total_dot", **of_chi, **dotted(of_chi))]
+    both = [over(spread, "B", **of_chi), over(spread_tangent, "B_dot", **of_chi, **dotted(of_chi))]
 
     @particle_kernel(tangent_module, "c_new_dot", both, numbers=["substeps"])
     @typed
-    def flux_tangent(total, total_dot, substeps: int, time_step, time_step_dot, m_i, m_dot_i, c_dot_i, s) -> fractions:
+    def flux_tangent(B, B_dot, substeps: int, time_step, time_step_dot, m_i, m_dot_i, c_dot_i, s) -> fractions:
         scale = time_step / real(substeps) * s.volume / m_i
-        return c_dot_i + scale * (total_dot + (time_step_dot / time_step - m_dot_i / m_i) * total)
+        return c_dot_i + scale * (B_dot + (time_step_dot / time_step - m_dot_i / m_i) * B)
 
     @particle_kernel(adjoint_module, "y", numbers=["substeps"])
     @typed

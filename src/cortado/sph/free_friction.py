@@ -41,59 +41,48 @@ class BodyFriction:
     """Arrays of the friction with one body; with a ``suffix`` of names, their tangents or adjoints."""
 
     def __init__(self, layout: Layout, suffix: str = ""):
-        precision = layout.precision
+        precision, members = layout.precision, layout.members
         real, vector, six = precision.real, precision.vector, precision.six
-        self.suffix = suffix
-        self.known = layout.arrays(suffix, H=real, Y=vector, N=precision.matrix, arm=vector)
-        self.found = layout.arrays(suffix, rub=vector, couple=vector)
-        self.load = layout.arrays(suffix, load=six)
-        self._sum = layout.sum_of(six)
-        kinds = {f"{name}{suffix}": (layout.members, vector) for name in VELOCITIES}
-        self.motion = zeros(kinds, layout.device)
-        """V and W at the start of the step with gravity and contact, and after the solve at its end."""
-        self.turned = wp.zeros(layout.members, dtype=vector, device=layout.device)
-        self.none_total = wp.zeros(layout.members, dtype=real, device=layout.device)
-        sums = {f"{name}{suffix}": (layout.members, vector) for name in ("pulled_sum", "twisted_sum")}
-        self.momenta = zeros(sums, layout.device)
-        """Momenta of the body from contact, friction and previous pressures, by argument names."""
-        self.impulse = {"impulse": wp.zeros(layout.members, dtype=six, device=layout.device)}
+        kinds = {"H": real, "Y": vector, "N": precision.matrix, "load": six}
+        self._load, self._sum = f"load{suffix}", layout.sum_of(six)
+        self._momenta = [f"{name}{suffix}" for name in ("pulled_sum", "twisted_sum")]
+        motion = [f"{name}{suffix}" for name in VELOCITIES] + self._momenta
+        self.arrays = layout.arrays(suffix, **kinds, **dict.fromkeys(("arm", "rub", "couple"), vector))
+        self.arrays |= zeros(dict.fromkeys(motion, (members, vector)), layout.device)
+        """By argument names; V and W are those at the start of the step with gravity and contact, and after the solve
+        at its end, and the last two the momenta of the body from contact, friction and previous pressures."""
+        self.turned = wp.zeros(members, dtype=vector, device=layout.device)
+        self.none_total = wp.zeros(members, dtype=real, device=layout.device)
+        self.impulse = {"impulse": wp.zeros(members, dtype=six, device=layout.device)}
         """J."""
 
+    def momenta(self, body: FreeBody | Changes) -> Iterator[tuple[wp.array, wp.array, wp.array]]:
+        """Yield the body's momenta, each with those from contact and from previous pressures."""
+        return zip((self.arrays[one] for one in self._momenta), body.given.values(), body.pressed.values(), strict=True)
+
     def add_up(self, body: FreeBody | Changes) -> None:
-        given = zip(self.momenta.values(), body.given.values(), body.pressed.values(), strict=True)
-        for total, one, pressed in given:
-            wp.copy(total, one)
+        for total, given, pressed in self.momenta(body):
+            wp.copy(total, given)
             add(pressed, total)
 
     def whole(self) -> wp.array:
-        return self._sum(self.load[f"load{self.suffix}"])
+        return self._sum(self.arrays[self._load])
 
 
 class BodyRows:
+    """Further unknowns of a solve, the momenta of a body in each scene (`cortado.sph.friction_kernels`)."""
+
     def __init__(self, layout: Layout):
         six, vector = layout.precision.six, layout.precision.vector
         kinds = {**dict.fromkeys(("r", "rise", "p", "y", "product", "first"), six), "V": vector, "W": vector}
         self.arrays = zeros({name: (layout.members, kind) for name, kind in kinds.items()}, layout.device)
+        self.velocities = {name: self.arrays[name] for name in "VW"}
         self.kernels, self._members = row_kernels(layout.precision), layout.members
         self.known: tuple[Named, ...] = ()
         self.load: Any = None
 
     def launch(self, step: StepContext, kernel: Any, *groups: Named, **arrays: Any) -> None:
         step.launch(kernel, self.arrays, *groups, *self.known, threads=self._members, **arrays)
-
-    def begin(self, step: StepContext, total: wp.array) -> None:
-        self.launch(step, self.kernels.lift, total=total)
-        self.launch(step, self.kernels.begin)
-
-    def multiply(self, step: StepContext, curvature: wp.array) -> None:
-        self.launch(step, self.kernels.multiply, load=self.load, curvature=curvature)
-
-    def descend(self, step: StepContext, scene: Named, total: wp.array) -> None:
-        self.launch(step, self.kernels.descend, scene)
-        self.launch(step, self.kernels.lift, total=total)
-
-    def turn(self, step: StepContext, scene: Named, total: wp.array) -> None:
-        self.launch(step, self.kernels.turn, scene, total=total)
 
 
 class FreeFriction:
@@ -126,12 +115,12 @@ class FreeFriction:
             step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for body, own, rows in self.each(step):
             rows.known = body.known(step)
-            step.launch(self.kernels.hold.forward, own.known, self.constants, *rows.known)
+            step.launch(self.kernels.hold.forward, own.arrays, self.constants, *rows.known)
 
     def gather(self, step: StepContext, sums: Named) -> None:
         for body, own, _ in self.each(step):
-            step.launch(self.kernels.thicken.forward, own.known, sums)
-            step.launch(self.kernels.lean.forward, own.known, sums, body.before)
+            step.launch(self.kernels.thicken.forward, own.arrays, sums)
+            step.launch(self.kernels.lean.forward, body.before, own.arrays, sums)
 
     def hang(self, step: StepContext, u: wp.array) -> None:
         """Subtract the velocity change by gravity from the particles' velocities u: pressures balance gravity."""
@@ -141,41 +130,38 @@ class FreeFriction:
     def start(self, step: StepContext) -> None:
         for body, own, _ in self.each(step):
             own.add_up(body)
-            self.launch(step, self.move.forward, own, body)
+            self.launch(step, self.move.forward, body, own.arrays)
 
-    def launch(self, step: StepContext, kernel: Any, own: BodyFriction, body: FreeBody, *groups: Named) -> None:
-        known = *groups, own.motion, own.momenta, begun(body), *body.known(step)
-        step.launch(kernel, *known, threads=self.layout.members)
+    def launch(self, step: StepContext, kernel: Any, body: FreeBody, *groups: Named) -> None:
+        step.launch(kernel, *groups, begun(body), *body.known(step), threads=self.layout.members)
 
     def pull(self, step: StepContext, *known: Named, v: wp.array) -> None:
         """Add the terms of bodies, at their present velocities, to A and T of velocities v."""
         for _, own, _ in self.each(step):
-            step.launch(self.kernels.pull, own.known, own.motion, self.constants, *known, v=v)
+            step.launch(self.kernels.pull, own.arrays, self.constants, *known, v=v)
 
     def push(self, step: StepContext, *known: Named, v: wp.array, acceleration: wp.array) -> None:
         """Add to the accelerations by the stress of velocities v, and write the residual of the bodies' rows."""
         for _, own, rows in self.each(step):
             self.rub(step, own, *known, v=v)
-            add(own.found["rub"], acceleration)
-            step.launch(self.kernels.bear.forward, own.known, own.found, own.load)
+            add(own.arrays["rub"], acceleration)
+            step.launch(self.kernels.bear.forward, own.arrays)
             wp.copy(rows.arrays["r"], own.whole())
 
     def rub(self, step: StepContext, own: BodyFriction, *known: Named, v: wp.array) -> None:
         """Write the accelerations and couples of particles by a body at its present velocities."""
-        step.launch(self.kernels.rub.forward, own.known, own.found, own.motion, self.constants, *known, v=v)
+        step.launch(self.kernels.rub.forward, own.arrays, self.constants, *known, v=v)
 
     def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
         """Add to B p and to the particles' terms of p^T B p, and write the loads of the bodies' rows."""
         for _, own, rows in self.each(step):
-            velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
-            step.launch(self.kernels.push, own.known, own.load, self.constants, found, *known, velocities)
+            step.launch(self.kernels.push, rows.velocities, own.arrays, self.constants, found, *known, v=p)
             rows.load = own.whole()
 
     def lean(self, step: StepContext, known: tuple[Named, ...], p: wp.array) -> None:
         """Add to A and T of p the terms of bodies that move with the velocities V and W of their rows."""
         for _, own, rows in self.each(step):
-            velocities = {"v": p, **{name: rows.arrays[name] for name in "VW"}}
-            step.launch(self.kernels.pull, own.known, self.constants, *known, velocities)
+            step.launch(self.kernels.pull, rows.velocities, own.arrays, self.constants, *known, v=p)
 
     def finish(self, step: StepContext) -> None:
         """Add the impulses of the solve to the bodies' momenta, and write the velocities at the end of the step."""
@@ -189,7 +175,7 @@ class FreeFriction:
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
                 self.rub(step, own, now, v=now["v"])
-                add(own.found[name], total)
+                add(own.arrays[name], total)
 
 
 class FrictionChanges:
@@ -217,7 +203,7 @@ class FrictionTangent(FrictionChanges):
     def begin(self, step: StepContext, dot: Tangents) -> None:
         of = self._friction
         for change, dots, _, _ in self._each(step, dot):
-            step.launch(of.kernels.hold.tangent, dots.known, *dot.named, of.constants, *change.body.known(step))
+            step.launch(of.kernels.hold.tangent, dots.arrays, *dot.named, of.constants, *change.body.known(step))
 
     def hang(self, step: StepContext, dot: Tangents, u_dot: wp.array) -> None:
         of = self._friction
@@ -233,38 +219,37 @@ class FrictionTangent(FrictionChanges):
     def gather(self, step: StepContext, dot: Tangents, sums: Named) -> None:
         kernels = self._friction.kernels
         for change, dots, own, _ in self._each(step, dot):
-            known = sums, dots.known, own.known, *dot.named
+            known = sums, dots.arrays, own.arrays, *dot.named
             step.launch(kernels.thicken.tangent, *known)
-            step.launch(kernels.lean.tangent, *known, change.before, change.body.before)
+            step.launch(kernels.lean.tangent, change.before, change.body.before, *known)
 
     def start(self, step: StepContext, dot: Tangents) -> None:
         of = self._friction
         for change, dots, own, _ in self._each(step, dot):
             dots.add_up(change)
             rates = {"density_dot": dot.parameters[change.body.table.weight]}
-            known = dots.motion, dots.momenta, begun(change), rates, *dot.named
-            of.launch(step, of.move.tangent, own, change.body, *known)
+            known = dots.arrays, begun(change), rates, *dot.named, own.arrays
+            of.launch(step, of.move.tangent, change.body, *known)
 
     def lean(self, step: StepContext, dot: Tangents, A_dot: wp.array, *known: Named) -> None:
         for _, dots, own, _ in self._each(step, dot):
-            groups = *known, dots.known, own.known, dots.motion, own.motion, *dot.named
+            groups = *known, dots.arrays, own.arrays, *dot.named
             step.launch(self._friction.kernels.lean.tangent, *groups, A_dot=A_dot)
 
     def push(self, step: StepContext, dot: Tangents, acceleration_dot: wp.array, *known: Named) -> None:
         kernels, time_step_dot = self._friction.kernels, dot.parameters["time_step"]
         for _, dots, own, rows in self._each(step, dot):
             self._rub(step, dot, dots, own, *known)
-            add(dots.found["rub_dot"], acceleration_dot)
-            known_dots = dots.known, dots.found, *dot.named, own.known, own.found
-            step.launch(kernels.bear.tangent, dots.load, *known_dots)
+            add(dots.arrays["rub_dot"], acceleration_dot)
+            step.launch(kernels.bear.tangent, dots.arrays, *dot.named, own.arrays)
             load = dots.whole()
             rows.launch(step, rows.kernels.lengthen, own.impulse, time_step_dot=time_step_dot, load=load)
             wp.copy(rows.arrays["r"], load)
 
     def _rub(self, step: StepContext, dot: Tangents, dots: BodyFriction, own: BodyFriction, *known: Named) -> None:
-        groups = *known, dots.known, dots.motion, *dot.named, own.known, own.motion, self._friction.constants
-        step.launch(self._friction.kernels.rub.forward, own.found, *groups)
-        step.launch(self._friction.kernels.rub.tangent, dots.found, *groups)
+        groups = *known, dots.arrays, *dot.named, own.arrays, self._friction.constants
+        step.launch(self._friction.kernels.rub.forward, *groups)
+        step.launch(self._friction.kernels.rub.tangent, *groups)
 
     def finish(self, step: StepContext, dot: Tangents) -> None:
         for change, dots, _, rows in self._each(step, dot):
@@ -275,7 +260,7 @@ class FrictionTangent(FrictionChanges):
         for change, dots, own, _ in self._each(step, dot):
             if solid in (ALL_WALLS, change.body.table.number):
                 self._rub(step, dot, dots, own, *known)
-                add(dots.found[f"{name}_dot"], total_dot)
+                add(dots.arrays[f"{name}_dot"], total_dot)
 
 
 class FrictionAdjoint(FrictionChanges):
@@ -292,9 +277,8 @@ class FrictionAdjoint(FrictionChanges):
 
     def begin(self, step: StepContext, bar: Adjoints) -> None:
         for _, bars, _, _ in self._each(step, bar):
-            for group in (bars.known, bars.found, bars.motion):
-                for array in group.values():
-                    array.zero_()
+            for array in bars.arrays.values():
+                array.zero_()
 
     def take(self, step: StepContext, bar: Adjoints) -> None:
         """Start the solve from the adjoints of the impulses on bodies, which are velocities."""
@@ -313,21 +297,20 @@ class FrictionAdjoint(FrictionChanges):
             wp.copy(rows.arrays["r"], rows.arrays["y"])
             rows.launch(step, rows.kernels.lift, total=bars.none_total)
             rows.launch(step, rows.kernels.answer, own.impulse, sizes)
-            step.launch(kernels.rub.forward, own.found, *known, own.known, own.motion, self._friction.constants)
-            groups = bars.known, bars.found, *bar.named, own.known, own.found
-            step.launch(kernels.bear.adjoint, solution, *groups)
-            add(acceleration_bar, bars.found["rub_bar"])
+            step.launch(kernels.rub.forward, *known, own.arrays, self._friction.constants)
+            step.launch(kernels.bear.adjoint, solution, bars.arrays, *bar.named, own.arrays)
+            add(acceleration_bar, bars.arrays["rub_bar"])
             self._rub(step, bar, bars, own, *known)
 
     def act(self, step: StepContext, bar: Adjoints, solid: int, name: str, total_bar: wp.array, *known: Named) -> None:
         for change, bars, own, _ in self._each(step, bar):
             if solid in (ALL_WALLS, change.body.table.number):
-                wp.copy(bars.found[f"{name}_bar"], total_bar)
+                wp.copy(bars.arrays[f"{name}_bar"], total_bar)
                 self._rub(step, bar, bars, own, *known)
 
     def _rub(self, step: StepContext, bar: Adjoints, bars: BodyFriction, own: BodyFriction, *known: Named) -> None:
-        groups = *known, bars.known, bars.found, *bar.named, own.known, own.motion, self._friction.constants
-        self._shared(step, self._friction.kernels.rub.adjoint, bars.motion, *groups)
+        groups = *known, bars.arrays, *bar.named, own.arrays, self._friction.constants
+        self._shared(step, self._friction.kernels.rub.adjoint, bars.arrays, *groups)
 
     def _shared(self, step: StepContext, kernel: Any, motion_bar: Named, *known: Named) -> None:
         for array in self._shares.values():
@@ -338,15 +321,15 @@ class FrictionAdjoint(FrictionChanges):
 
     def lean(self, step: StepContext, bar: Adjoints, A_bar: wp.array, *known: Named) -> None:
         for _, bars, own, _ in self._each(step, bar):
-            groups = *known, bars.known, *bar.named, own.known, own.motion
-            self._shared(step, self._friction.kernels.lean.adjoint, bars.motion, {"A_bar": A_bar}, *groups)
+            groups = {"A_bar": A_bar}, *known, bars.arrays, *bar.named, own.arrays
+            self._shared(step, self._friction.kernels.lean.adjoint, bars.arrays, *groups)
 
     def gather(self, step: StepContext, bar: Adjoints, sums_bar: Named) -> None:
         kernels = self._friction.kernels
         for change, bars, own, _ in self._each(step, bar):
-            groups = sums_bar, bars.known, *bar.named, own.known
+            groups = sums_bar, bars.arrays, *bar.named, own.arrays
             step.launch(kernels.thicken.adjoint, *groups)
-            self._shared(step, kernels.lean.adjoint, change.before, *groups, change.body.before)
+            self._shared(step, kernels.lean.adjoint, change.before, change.body.before, *groups)
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
         """Apply the adjoints of the bodies' velocities at the end and of H, Y, N and r. Add to the adjoint of gravity
@@ -361,17 +344,12 @@ class FrictionAdjoint(FrictionChanges):
         for change, bars, own, _ in self._each(step, bar):
             body = change.body
             rates = {"density_bar": bar.parameters[body.table.weight], "time_step_bar": bar.parameters["time_step"]}
-            turned = {"turned_bar": bars.turned}
+            rates["turned_bar"] = bars.turned
             bars.turned.zero_()
-            of.launch(
-                step, of.move.adjoint, own, body, bars.motion, bars.momenta, begun(change), rates, turned, *bar.named
-            )
-            for total, given, pressed in zip(
-                bars.momenta.values(), change.given.values(), change.pressed.values(), strict=True
-            ):
+            of.launch(step, of.move.adjoint, body, bars.arrays, begun(change), rates, *bar.named, own.arrays)
+            for total, given, pressed in bars.momenta(change):
                 add(total, given)
                 add(total, pressed)
             bar.solids.add_whole(body.table.number, turned_bar=bars.turned)
-            given = bar.solids.of(body.table.number)
-            known = bars.known, own.known, *bar.named, of.constants, *body.known(step)
-            step.launch(of.kernels.hold.adjoint, given, *known)
+            known = bar.solids.of(body.table.number), bars.arrays, own.arrays, *bar.named, of.constants
+            step.launch(of.kernels.hold.adjoint, *known, *body.known(step))

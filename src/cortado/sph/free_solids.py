@@ -254,7 +254,87 @@ class FreeBody:
         return self.constants, self.state(self.begun), {"density": density}
 
 
+class Changes:
+    def __init__(self, body: FreeBody, layout: Layout, suffix: str):
+        vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
+        self.body = body
+        self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
+        self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
+        self.turned_end = wp.zeros(**vectors)
+        """The term, from the end of the step, of the adjoint of a further turn of R."""
+
+    def clear(self) -> None:
+        groups = self.before, self.moved, self.given, self.pressed
+        for array in (*(array for group in groups for array in group.values()), self.turned_end):
+            array.zero_()
+
+
+class FreeSolidsTangent(PartTangent):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
+        self._pushes = [push.tangent(self.bodies) for push in part.pushes]
+
+    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._launch(self.part.begins.tangent, step, dot, state_dot, begins=True)
+
+    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        for own in self.bodies:
+            for array in own.given.values():
+                array.zero_()
+        for push in self._pushes:
+            push.look(step, dot)
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._launch(self.part.ends.tangent, step, dot, state_dot, begins=False)
+
+    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State, begins: bool) -> None:
+        part = self.part
+        for own in self.bodies:
+            body = own.body
+            sizes = {f"{name}_dot": dot.parameters[name] for name in ("time_step", "gravity")}
+            sizes["density_dot"] = dot.parameters[body.table.weight]
+            dots = {**body.state(state_dot, "_dot"), **body.state(state_dot, "_new_dot"), **sizes}
+            moves = (own.before,) if begins else (own.moved, body.moved)
+            step.launch(kernel, dots, *moves, *body.known(step), threads=part.layout.members)
+
+
+class FreeSolidsAdjoint(PartAdjoint):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]
+        self._pushes = [push.adjoint(self.bodies) for push in reversed(part.pushes)]
+
+    def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
+        part = self.part
+        for own in self.bodies:
+            bars, body = {**self._bars(own, bar, state_bar), "turned_before_bar": own.turned_end}, own.body
+            known = (own.moved, body.moved, *body.known(step))
+            step.launch(part.ends.adjoint, bars, *known, threads=part.layout.members)
+        return moved_bar
+
+    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        for push in self._pushes:
+            push.look(step, bar)
+
+    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        part = self.part
+        for own in self.bodies:
+            body, bars = own.body, {**self._bars(own, bar.parameters, state_bar), **own.before}
+            given = bar.solids.collect(body.table.number)
+            add(own.turned_end, given["turned_before_bar"])
+            step.launch(part.begins.adjoint, bars, given, *body.known(step), threads=part.layout.members)
+            own.clear()
+
+    def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
+        sizes = {f"{name}_bar": bar[name] for name in ("time_step", "gravity")}
+        sizes["density_bar"] = bar[own.body.table.weight]
+        return {**own.body.state(state_bar, "_bar"), **own.body.state(state_bar, "_new_bar"), **sizes}
+
+
 class FreeSolidsPart(Part):
+    derivatives = FreeSolidsTangent, FreeSolidsAdjoint
+
     def __init__(self, made_of: FreeSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
         poses = made_of.walls.each
@@ -280,87 +360,3 @@ class FreeSolidsPart(Part):
         for body in self.bodies:
             new = body.state(state, "_new")
             step.launch(self.ends.forward, new, body.moved, *body.known(step), threads=self.layout.members)
-
-    def new_tangent(self) -> "FreeSolidsTangent":
-        return FreeSolidsTangent(self)
-
-    def new_adjoint(self) -> "FreeSolidsAdjoint":
-        return FreeSolidsAdjoint(self)
-
-
-class Changes:
-    def __init__(self, body: FreeBody, layout: Layout, suffix: str):
-        vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
-        self.body = body
-        self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
-        self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
-        self.turned_end = wp.zeros(**vectors)
-        """The term, from the end of the step, of the adjoint of a further turn of R."""
-
-    def clear(self) -> None:
-        groups = self.before, self.moved, self.given, self.pressed
-        for array in (*(array for group in groups for array in group.values()), self.turned_end):
-            array.zero_()
-
-
-class FreeSolidsTangent(PartTangent):
-    def __init__(self, part: FreeSolidsPart):
-        self._part = part
-        self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
-        self._pushes = [push.tangent(self.bodies) for push in part.pushes]
-
-    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self._part.begins.tangent, step, dot, state_dot, begins=True)
-
-    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        for own in self.bodies:
-            for array in own.given.values():
-                array.zero_()
-        for push in self._pushes:
-            push.look(step, dot)
-
-    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self._part.ends.tangent, step, dot, state_dot, begins=False)
-
-    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State, begins: bool) -> None:
-        part = self._part
-        for own in self.bodies:
-            body = own.body
-            sizes = {f"{name}_dot": dot.parameters[name] for name in ("time_step", "gravity")}
-            sizes["density_dot"] = dot.parameters[body.table.weight]
-            dots = {**body.state(state_dot, "_dot"), **body.state(state_dot, "_new_dot"), **sizes}
-            moves = (own.before,) if begins else (own.moved, body.moved)
-            step.launch(kernel, dots, *moves, *body.known(step), threads=part.layout.members)
-
-
-class FreeSolidsAdjoint(PartAdjoint):
-    def __init__(self, part: FreeSolidsPart):
-        self._part = part
-        self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]
-        self._pushes = [push.adjoint(self.bodies) for push in reversed(part.pushes)]
-
-    def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
-        part = self._part
-        for own in self.bodies:
-            bars, body = {**self._bars(own, bar, state_bar), "turned_before_bar": own.turned_end}, own.body
-            known = (own.moved, body.moved, *body.known(step))
-            step.launch(part.ends.adjoint, bars, *known, threads=part.layout.members)
-        return moved_bar
-
-    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        for push in self._pushes:
-            push.look(step, bar)
-
-    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        part = self._part
-        for own in self.bodies:
-            body, bars = own.body, {**self._bars(own, bar.parameters, state_bar), **own.before}
-            given = bar.solids.collect(body.table.number)
-            add(own.turned_end, given["turned_before_bar"])
-            step.launch(part.begins.adjoint, bars, given, *body.known(step), threads=part.layout.members)
-            own.clear()
-
-    def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
-        sizes = {f"{name}_bar": bar[name] for name in ("time_step", "gravity")}
-        sizes["density_bar"] = bar[own.body.table.weight]
-        return {**own.body.state(state_bar, "_bar"), **own.body.state(state_bar, "_new_bar"), **sizes}

@@ -192,8 +192,8 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
     ``rise`` are the velocities that the momenta r give the body, which may be held (`cortado.sph.moving_solids`); V and
     W are the velocities by p.
 
-    `Rows` of `cortado.sph.moment_functions` need ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give``
-    adds the impulse of the solution to the body's momenta; ``lengthen`` adds the time step's tangent to that of a load.
+    `cortado.sph.viscous_solve` calls ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give`` adds the
+    impulse of the solution to the body's momenta; ``lengthen`` adds the time step's tangent to that of a load.
     ``take`` starts the adjoint solve from velocities, the adjoint of the impulse, and ``heed`` writes their residual r.
     ``answer`` adds the velocities of the solution, and adds to the adjoint of the time step.
     """

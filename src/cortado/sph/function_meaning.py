@@ -18,7 +18,7 @@ import warp as wp
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError
-from cortado.sph.function_text import counts_of
+from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, check_returns, counts_of
 
 REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "cortado_nearest", "cortado_whole"
 """Names, in compiled texts, of the functions for a % b, a // b, round(a) and int(a)."""
@@ -69,11 +69,8 @@ Lines = ast.AST | list[ast.stmt]
 class InPrecision(ast.NodeTransformer):
     """A rewriting of a function's text for a precision: outside values are written out, loops are unrolled."""
 
-    def __init__(
-        self, what: str, scope: Mapping[str, Any], local: set[str], arrays: Mapping[str, tuple[int, ...]] | None = None
-    ):
+    def __init__(self, what: str, scope: Mapping[str, Any], local: set[str], shapes: Mapping[str, tuple[int, ...]]):
         self._what, self._scope, self._local = what, scope, local
-        shapes = arrays or {}
         sizes = [prod(shape) for shape in shapes.values()]
         self._arrays = {name: (sum(sizes[:k]), shape) for k, (name, shape) in enumerate(shapes.items())}
         """Arrays, each with the index of its first number in the table of all arrays, and its shape."""
@@ -229,6 +226,30 @@ def _number(node: ast.expr, value: Any) -> ast.AST:
     if not isinstance(value, (int, float, np.integer, np.floating)):
         return node
     return ast.Call(ast.Name(REAL, ast.Load()), [ast.Constant(float(value))], [])
+
+
+MOST_TURNS = 256
+
+
+def text_for_warp(
+    what: str, function: ast.FunctionDef, frozen: Frozen, shapes: Mapping[str, tuple[int, ...]], kind: str
+) -> str:
+    """Return the text of a user's function for Warp, in the precision of the run. Raise `InputError` for code that Warp
+    lacks, cannot differentiate or understands differently from Python, and if the function may not return a ``kind``.
+    ``shapes`` are those of arrays."""
+    for helper in frozen.helpers:
+        tree = helper.adj.tree
+        DerivativeCheck(what).visit(tree)
+        check_helper(what, tree.body[0])
+    DerivativeCheck(what, MOST_TURNS).visit(function)
+    local = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    own = local | {argument.arg for argument in function.args.args}
+    check_returns(what, function, kind)
+    check_names(what, function, own, frozen.scope)
+    check_calls(what, function, own, frozen.scope)
+    check_truths(what, function)
+    rewritten = InPrecision(what, frozen.scope, own, shapes).visit(ast.Module([function], []))
+    return ast.unparse(ast.fix_missing_locations(rewritten)) + "\n"
 
 
 BUILTINS = ("abs", "float", "int", "max", "min", "pow", "range", "round")

@@ -102,8 +102,61 @@ class Phases:
         return Mixture(self, layout, requires_grad)
 
 
+class MixtureTangent(PartTangent):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        self._c_dot, self._chi_dot, self._w_dot = [part.fractions() for _ in range(2)], part.fractions(), part.numbers()
+
+    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        mixture, kernels, diffusion, known = self.part, self.part.kernels, self.part.diffusion, dot.named
+        substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
+        course = [*(self._c_dot[k % 2] for k in range(substeps)), dot.fractions]
+        if mixture.phases.count > 1:
+            step.launch(kernels.order.sort, a_scene=state_dot.mass_fractions, a=course[0])
+        for k in range(substeps):
+            assert diffusion is not None
+            c_dot, c_new_dot = course[k : k + 2]
+            given = {"strength": mixture.phases.strength, "c": mixture.c[k], "c_dot": c_dot}
+            step.launch(diffusion.potential.tangent, *known, **given, **now)
+            flux = {"chi": mixture.chi[k], "w": mixture.w[k], "c_dot": c_dot, "c_new_dot": c_new_dot}
+            step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
+        step.launch(kernels.blend.tangent, *known, c=step.fractions, c_dot=dot.fractions)
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        if self.part.phases.count > 1:
+            step.launch(self.part.kernels.order.unsort, a=dot.fractions, a_scene=state_dot.mass_fractions)
+
+
+class MixtureAdjoint(PartAdjoint):
+    def __init__(self, part: Any):
+        super().__init__(part)
+        self._y, self._z = part.fractions(), part.fractions()
+
+    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        """Turn the adjoint of the new fractions, in scene order, into that of the old fractions."""
+        with step.aside() if not self.part.substeps else nullcontext():
+            self._unmix(step, bar, state_bar.mass_fractions)
+
+    def _unmix(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
+        mixture, kernels, diffusion, known = self.part, self.part.kernels, self.part.diffusion, bar.named
+        substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, bar.fractions, self._y, self._z
+        step.launch(kernels.blend.adjoint, *known, c=step.fractions, c_scene_bar=fractions_bar, c_bar=c_bar)
+        for k in reversed(range(substeps)):
+            assert diffusion is not None
+            scale, flux = diffusion.flux.adjoint
+            c, chi, w = mixture.c[k], mixture.chi[k], mixture.w[k]
+            step.launch(scale, substeps=substeps, c_bar=c_bar, y=y)
+            step.launch(flux, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
+            step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
+        if mixture.phases.count > 1:
+            step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
+            c_bar.zero_()
+
+
 class Mixture(Part):
     """The part of a step for the composition of particles."""
+
+    derivatives = MixtureTangent, MixtureAdjoint
 
     def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
         self.phases = phases
@@ -163,62 +216,3 @@ class Mixture(Part):
     def end(self, step: StepContext, state: State, moved: State) -> None:
         if self.phases.count > 1:
             step.launch(self.kernels.order.unsort, a=step.fractions, a_scene=state.mass_fractions)
-
-    def new_tangent(self) -> "MixtureTangent":
-        return MixtureTangent(self)
-
-    def new_adjoint(self) -> "MixtureAdjoint":
-        return MixtureAdjoint(self)
-
-
-class MixtureAdjoint(PartAdjoint):
-    def __init__(self, mixture: Mixture):
-        self._mixture = mixture
-        self._y, self._z = (mixture.fractions() for _ in range(2))
-
-    def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Turn the adjoint of the new fractions, in scene order, into that of the old fractions."""
-        with step.aside() if not self._mixture.substeps else nullcontext():
-            self._unmix(step, bar, state_bar.mass_fractions)
-
-    def _unmix(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
-        mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, bar.named
-        substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, bar.fractions, self._y, self._z
-        step.launch(kernels.blend.adjoint, *known, c=step.fractions, c_scene_bar=fractions_bar, c_bar=c_bar)
-        for k in reversed(range(substeps)):
-            assert diffusion is not None
-            scale, flux = diffusion.flux.adjoint
-            c, chi, w = mixture.c[k], mixture.chi[k], mixture.w[k]
-            step.launch(scale, substeps=substeps, c_bar=c_bar, y=y)
-            step.launch(flux, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
-            step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
-        if mixture.phases.count > 1:
-            step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
-            c_bar.zero_()
-
-
-class MixtureTangent(PartTangent):
-    def __init__(self, mixture: Mixture):
-        self._mixture = mixture
-        self._c_dot = [mixture.fractions() for _ in range(2)]
-        self._chi_dot = mixture.fractions()
-        self._w_dot = mixture.numbers()
-
-    def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        mixture, kernels, diffusion, known = self._mixture, self._mixture.kernels, self._mixture.diffusion, dot.named
-        substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
-        course = [*(self._c_dot[k % 2] for k in range(substeps)), dot.fractions]
-        if mixture.phases.count > 1:
-            step.launch(kernels.order.sort, a_scene=state_dot.mass_fractions, a=course[0])
-        for k in range(substeps):
-            assert diffusion is not None
-            c_dot, c_new_dot = course[k : k + 2]
-            given = {"strength": mixture.phases.strength, "c": mixture.c[k], "c_dot": c_dot}
-            step.launch(diffusion.potential.tangent, *known, **given, **now)
-            flux = {"chi": mixture.chi[k], "w": mixture.w[k], "c_dot": c_dot, "c_new_dot": c_new_dot}
-            step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
-        step.launch(kernels.blend.tangent, *known, c=step.fractions, c_dot=dot.fractions)
-
-    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        if self._mixture.phases.count > 1:
-            step.launch(self._mixture.kernels.order.unsort, a=dot.fractions, a_scene=state_dot.mass_fractions)

@@ -31,7 +31,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls, turn_functions
 from cortado.particles.neighbours import NeighbourSearch
@@ -45,19 +45,10 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 @cache
 def hold_type(precision: Precision) -> Any:
-    vector = precision.vector
-
-    class HoldNumbers:
-        moving: vector
-        """1 along the axes along which the body may move, 0 along others."""
-        arm: vector
-        """a, from the centre of mass to the hinge, in the body's frame [m]."""
-        axis: vector
-        """The only free axis of rotation, or with two free axes the held one."""
-        turning: wp.int32
-
-    HoldNumbers.__name__ = HoldNumbers.__qualname__ = f"HoldNumbers_{precision.name}"
-    return wp.struct(HoldNumbers)
+    """Return the Warp struct of a hold. ``moving`` is 1 along axes along which the body may move, 0 along others, and
+    ``arm`` is a [m]. ``turning`` axes of rotation are free; ``axis`` is the only one, or of two the held one."""
+    vectors = dict.fromkeys(("moving", "arm", "axis"), precision.vector)
+    return struct_of("HoldNumbers", precision, **vectors, turning=wp.int32)
 
 
 def hold_numbers(hold: Hold, precision: Precision) -> Any:
@@ -255,8 +246,39 @@ class MovingSolids:
         return MovingSolidsPart(self, layout)
 
 
+class MovingSolidsTangent(PartTangent):
+    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        walls = self.part.made_of.walls
+        self._launch(self.part.poses.tangent, step, dot, state_dot)
+        sizes = step.parameters["time_step"], dot.parameters["time_step"]
+        walls.write_tangent(*sizes, self.part.made_of.search.walls)
+
+    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        self._launch(self.part.ends.tangent, step, dot, state_dot)
+
+    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State) -> None:
+        part = self.part
+        for name, number in part.made_of.numbers.items():
+            dots = part.told(dot.parameters, name, "_dot"), part.state(state_dot, name, "_new_dot")
+            known = part.state(part.begun, name), part.told(step.parameters, name), part.made_of.walls.each[number]
+            step.launch(kernel, part.state(state_dot, name, "_dot"), *dots, *known, threads=part.layout.members)
+
+
+class MovingSolidsAdjoint(PartAdjoint):
+    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
+        part = self.part
+        for name, number in part.made_of.numbers.items():
+            bars = part.told(bar.parameters, name, "_bar"), part.state(state_bar, name, "_new_bar")
+            known = part.state(part.begun, name), part.told(step.parameters, name), bar.solids.collect(number)
+            for kernels in (part.ends, part.poses):
+                all_bars = part.state(state_bar, name, "_bar"), *bars
+                step.launch(kernels.adjoint, *all_bars, *known, threads=part.layout.members)
+
+
 class MovingSolidsPart(Part):
     """The part of a step that puts the walls of moving solids where they are at its end, also those of other parts."""
+
+    derivatives = MovingSolidsTangent, MovingSolidsAdjoint
 
     def __init__(self, made_of: MovingSolids, layout: Layout):
         self.made_of, self.layout = made_of, layout
@@ -292,44 +314,3 @@ class MovingSolidsPart(Part):
     def told(self, parameters: Parameters, name: str, suffix: str = "") -> dict[str, wp.array]:
         told = {"place": position_name(name), "displacements": displacement_name(name), "turns_told": turn_name(name)}
         return {f"{label}{suffix}": parameters[parameter] for label, parameter in told.items()}
-
-    def new_tangent(self) -> "MovingSolidsTangent":
-        return MovingSolidsTangent(self)
-
-    def new_adjoint(self) -> "MovingSolidsAdjoint":
-        return MovingSolidsAdjoint(self)
-
-
-class MovingSolidsTangent(PartTangent):
-    def __init__(self, part: MovingSolidsPart):
-        self._part = part
-
-    def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        walls = self._part.made_of.walls
-        self._launch(self._part.poses.tangent, step, dot, state_dot)
-        sizes = step.parameters["time_step"], dot.parameters["time_step"]
-        walls.write_tangent(*sizes, self._part.made_of.search.walls)
-
-    def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self._part.ends.tangent, step, dot, state_dot)
-
-    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        part = self._part
-        for name, number in part.made_of.numbers.items():
-            dots = part.told(dot.parameters, name, "_dot"), part.state(state_dot, name, "_new_dot")
-            known = part.state(part.begun, name), part.told(step.parameters, name), part.made_of.walls.each[number]
-            step.launch(kernel, part.state(state_dot, name, "_dot"), *dots, *known, threads=part.layout.members)
-
-
-class MovingSolidsAdjoint(PartAdjoint):
-    def __init__(self, part: MovingSolidsPart):
-        self._part = part
-
-    def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        part = self._part
-        for name, number in part.made_of.numbers.items():
-            bars = part.told(bar.parameters, name, "_bar"), part.state(state_bar, name, "_new_bar")
-            known = part.state(part.begun, name), part.told(step.parameters, name), bar.solids.collect(number)
-            for kernels in (part.ends, part.poses):
-                all_bars = part.state(state_bar, name, "_bar"), *bars
-                step.launch(kernels.adjoint, *all_bars, *known, threads=part.layout.members)

@@ -1,4 +1,4 @@
-"""Arrays as parameters of a user's function, such as the weights of a network or a field on a grid.
+"""The parameters of a user's function in kernels, also arrays, such as the weights of a network or a field on a grid.
 
 All arrays of a force are concatenated in a table w (members, numbers). The value read for a particle is w_k + e w_dot_k
 with e = 0, so that the tangent along w_dot is the derivative with respect to e, which is treated as a number of the
@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import by_name, kernel_module, kind_of
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.device.reduction import sum_of
 from cortado.particles.state import Layout, Parameters, components
 from cortado.scene.parameters import Axis, Parameter
@@ -29,12 +29,15 @@ ROWS, MOST_PARTIAL = {"cpu": 16, "cuda": 2**15}, 2**24
 READ_AS = {"e": "_no", "member": "i // particles", "row": "_row"}
 
 
+def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
+    """Return the Warp vector type of parameters of these ranks, with at least one number."""
+    return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
+
+
 @cache
 def table_type(precision: Precision) -> Any:
     """Return the Warp struct of a force's arrays: w, w_dot, and the rows of w's adjoint, (numbers, members x rows)."""
-    numbers = wp.array2d(dtype=precision.real)
-    fields = {"__annotations__": dict.fromkeys(("values", "dots", "rows"), numbers), "__module__": __name__}
-    return wp.struct(type(f"Table_{precision.name}", (), fields))
+    return struct_of("Table", precision, **dict.fromkeys(("values", "dots", "rows"), wp.array2d(dtype=precision.real)))
 
 
 def arrays_module(precision: Precision, forward: bool, taped: bool = False) -> Any:
@@ -123,16 +126,24 @@ class Numbers:
             step.launch(getattr(self._kernels, kernel), threads=self._members * size, **given)
 
 
-class Tables:
-    """A table for each scene with all arrays of a user's function, with tangent and adjoint."""
+class OwnParameters:
+    """A user's function's parameters by names of kernel arguments, with tangent and adjoint: times, numbers and
+    vectors as one vector theta, and all arrays as one table, for each scene."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
-        self._layout = layout
+        self._layout, own = layout, [one for one in parameters if one.axis is not Axis.ARRAY]
+        self._numbers = Numbers(own, layout, taped)
         self._arrays = Numbers([one for one in parameters if one.axis is Axis.ARRAY], layout, taped)
-        self._size = self._arrays.size
+        self._size, members = self._arrays.size, layout.members
+        dtype = theta_of(layout.precision, [one.rank for one in own])
+        options: dict[str, Any] = {"dtype": dtype, "device": layout.device}
+        self._theta, self._theta_dot = wp.zeros(members, **options, requires_grad=taped), wp.zeros(members, **options)
+        self._theta_bar = wp.zeros(layout.all_particles, **options)
+        """(n,) each particle's term of the adjoint of theta in a step."""
+        self._sum_theta = layout.sum_of(dtype) if own else None
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
-        self.rows = max(min(most, MOST_PARTIAL // (layout.members * max(self._size, 1))), 1)
-        self._table = self._new(values=self._numbers(layout.members, self._size, requires_grad=taped))
+        self.rows = max(min(most, MOST_PARTIAL // (members * max(self._size, 1))), 1)
+        self._table = self._new(values=self._zeros(members, self._size, requires_grad=taped))
 
     @property
     def threads(self) -> int | None:
@@ -140,34 +151,46 @@ class Tables:
         return self._layout.members * self.rows if self._size else None
 
     def now(self, step: StepContext) -> dict[str, Any]:
-        return self._packed(step, self._table) if self._size else {}
+        return self._told(step, "_table")
 
     def along(self, step: StepContext, parameters_dot: Parameters) -> dict[str, Any]:
-        if not self._size:
-            return {}
-        self._arrays.pack(step, parameters_dot, self._along.dots)
-        return self._packed(step, self._along)
+        if self._size:
+            self._arrays.pack(step, parameters_dot, self._along.dots)
+        return {**self._told(step, "_along"), "theta_dot": self._packed(step, parameters_dot, self._theta_dot)}
 
     def back(self, step: StepContext) -> dict[str, Any]:
-        return {**self._packed(step, self._back), "rows": self.rows} if self._size else {}
+        return {**self._told(step, "_back"), "theta_bar": self._theta_bar, "rows": self.rows}
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
+        """Add the adjoints of theta and of the table to those of the parameters."""
+        if self._sum_theta is not None:
+            self._numbers.add(step, self._flat(self._sum_theta(self._theta_bar)), bar.parameters)
         if self._size:
             total = self._sum(self._back.rows.flatten()).reshape((self._size, self._layout.members))
             self._arrays.add(step, total.transpose((1, 0)), bar.parameters)
             self._back.rows.zero_()
 
-    def _packed(self, step: StepContext, table: Any) -> dict[str, Any]:
-        self._arrays.pack(step, step.parameters, table.values)
-        return {"table": table}
+    def _told(self, step: StepContext, name: str) -> dict[str, Any]:
+        found = {"theta": self._packed(step, step.parameters, self._theta)}
+        if self._size:
+            found["table"] = getattr(self, name)
+            self._arrays.pack(step, step.parameters, found["table"].values)
+        return found
+
+    def _packed(self, step: StepContext, values: Parameters, theta: wp.array) -> wp.array:
+        self._numbers.pack(step, values, self._flat(theta))
+        return theta
+
+    def _flat(self, theta: wp.array) -> wp.array:
+        return components(theta, (len(theta), theta.dtype._length_))
 
     @cached_property
     def _along(self) -> Any:
-        return self._new(values=self._table.values, dots=self._numbers(self._layout.members, self._size))
+        return self._new(values=self._table.values, dots=self._zeros(self._layout.members, self._size))
 
     @cached_property
     def _back(self) -> Any:
-        return self._new(values=self._table.values, rows=self._numbers(self._size, self._layout.members * self.rows))
+        return self._new(values=self._table.values, rows=self._zeros(self._size, self._layout.members * self.rows))
 
     @cached_property
     def _sum(self) -> Any:
@@ -175,11 +198,11 @@ class Tables:
         return sum_of(layout.precision.real, self.rows, layout.device, self._size * layout.members)
 
     def _new(self, **arrays: wp.array) -> Any:
-        made, none = table_type(self._layout.precision)(), self._numbers(0, 0)
+        made, none = table_type(self._layout.precision)(), self._zeros(0, 0)
         for name in ("values", "dots", "rows"):
             setattr(made, name, arrays.get(name, none))
         return made
 
-    def _numbers(self, *shape: int, requires_grad: bool = False) -> wp.array:
+    def _zeros(self, *shape: int, requires_grad: bool = False) -> wp.array:
         options = {"device": self._layout.device, "requires_grad": requires_grad}
         return wp.zeros(shape, dtype=self._layout.precision.real, **options)

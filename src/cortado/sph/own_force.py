@@ -38,9 +38,9 @@ from cortado.scene.courses import Knots
 from cortado.scene.parameter_values import TIME, Arrays
 from cortado.scene.parameters import Axis, Parameter, Source
 from cortado.scene.scene import Scene
-from cortado.sph.formula import Formula, Packed, applied, compiled, formula, theta_of
+from cortado.sph.formula import Formula, applied, compiled, formula
 from cortado.sph.function_text import keep_source, plain_function, source_of
-from cortado.sph.own_arrays import READ_AS, Tables
+from cortado.sph.own_arrays import READ_AS, OwnParameters, theta_of
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, check_law
 from cortado.sph.stress_kernels import VelocityGradients, gradient_functions
@@ -145,9 +145,12 @@ class OwnFunction(ABC):
 
 
 class OwnForce(OwnFunction):
-    @abstractmethod
+    _made_by: ClassVar[Callable[[Discretisation, Formula, tuple[int, ...], int], Kernels]]
+    """Function that makes the kernels of the force in 2 or 3 dimensions."""
+
     def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
         """Make the kernels of the force in a scene of 2 or 3 dimensions with a number of phases."""
+        return type(self)._made_by(discretisation, self._formula.of_phases(self._what, phases), self._ranks, dimension)
 
     def force(self, setting: Setting) -> "FunctionForce":
         kernels = self.kernels(setting.discretisation, setting.scene.dimension, setting.layout.phases)
@@ -164,8 +167,7 @@ class FunctionForce:
         self, what: str, kernels: Kernels, parameters: tuple[Parameter, ...], fields: tuple[str, ...], setting: Setting
     ):
         self._what, self._kernels, self._device = what, kernels, setting.layout.device
-        self._packed = Packed(parameters, setting.layout, setting.discretisation.taped)
-        self._tables = Tables(parameters, setting.layout, setting.discretisation.taped)
+        self._own = OwnParameters(parameters, setting.layout, setting.discretisation.taped)
         takes_gradients = not {"shear_rate", "velocity_gradient"}.isdisjoint(fields)
         self._gradients = VelocityGradients(setting) if takes_gradients else None
 
@@ -182,23 +184,18 @@ class FunctionForce:
         return self.compile(self._kernels.adjoint)
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        now = {"theta": self._packed.theta(step), "acceleration_in": before, "acceleration": after}
         sums = self._gradients.measure(step) if self._gradients else {}
-        step.launch(self._kernels.forward, self._tables.now(step), sums, **now)
+        step.launch(self._kernels.forward, self._own.now(step), sums, acceleration_in=before, acceleration=after)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
         now = {"acceleration_in_dot": before, "acceleration_dot": after}
         sums = self._gradients.tangent(step, dot) if self._gradients else {}
-        step.launch(self._tangent, self._tables.along(step, dot.parameters), sums, *dot.named, **theta, **now)
+        step.launch(self._tangent, self._own.along(step, dot.parameters), sums, *dot.named, **now)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
-        now = {"theta": self._packed.theta(step), "acceleration_bar": acceleration_bar}
-        sums = self._gradients.known() if self._gradients else {}
-        known, shares = (self._tables.back(step), sums, *bar.named), self._packed.shares
-        step.launch(self._adjoint, *known, **now, theta_bar=shares, threads=self._tables.threads)
-        self._packed.collect(step, bar)
-        self._tables.collect(step, bar)
+        known = self._own.back(step), self._gradients.known() if self._gradients else {}, *bar.named
+        step.launch(self._adjoint, *known, acceleration_bar=acceleration_bar, threads=self._own.threads)
+        self._own.collect(step, bar)
         if self._gradients:
             self._gradients.adjoint(step, bar)
 
@@ -287,10 +284,7 @@ class Body(OwnForce):
         simulation = cortado.Simulation("dam.toml", forces=[cortado.forces.Body(drag, k=2.0)])
     """
 
-    kind = "Body"
-
-    def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
-        return body_kernels(discretisation, self._formula.of_phases(self._what, phases), self._ranks, dimension)
+    kind, _made_by = "Body", staticmethod(body_kernels)
 
 
 def term(
@@ -334,10 +328,7 @@ class Pair(OwnForce):
         simulation = cortado.Simulation("dam.toml", forces=[cortado.forces.Pair(pull, k=1e-3)])
     """
 
-    kind = "Pair"
-
-    def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
-        return pair_kernels(discretisation, self._formula, self._ranks, dimension)
+    kind, _made_by = "Pair", staticmethod(pair_kernels)
 
 
 class Rheology(OwnFunction):
@@ -360,7 +351,9 @@ class Rheology(OwnFunction):
     def force(self, setting: Setting) -> ViscousStress:
         """Make the viscous force with this law. Raise `InputError` if Warp cannot compile the function, or if a
         viscosity that the function returns is negative or not finite."""
-        check_form(setting.scene)
+        if setting.scene.forces.viscosity != "stress":
+            found = f"forces.viscosity is {setting.scene.forces.viscosity!r}"
+            raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")
         made = stress_of(setting.scene)(setting, self._law(setting.scene), self.parameters)
         made.compile(self._what)
         self._try({}, setting.scene, setting.layout.precision, setting.layout.device)
@@ -396,9 +389,3 @@ class Rheology(OwnFunction):
             rows = np.broadcast_to(found, (len(times), *found.shape[-1:] * is_vector))
             columns += [padded(rows) if is_vector else rows]
         return np.column_stack([np.zeros((len(times), 0)), *columns])
-
-
-def check_form(scene: Scene) -> None:
-    if scene.forces.viscosity != "stress":
-        found = f"forces.viscosity is {scene.forces.viscosity!r}"
-        raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")

@@ -180,6 +180,9 @@ class Force(Protocol):
 
 
 class PartTangent:
+    def __init__(self, part: Any = None):
+        self.part = part
+
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         """Apply the tangent of `Part.begin` to the tangent of the state before the step."""
 
@@ -193,6 +196,9 @@ class PartTangent:
 
 
 class PartAdjoint:
+    def __init__(self, part: Any = None):
+        self.part = part
+
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         """Apply the adjoint of a part with a `Part.target`: turn the adjoint of positions and velocities after the part
         into that before the part, return it, and add to ``bar``. Sorted particles have no adjoints yet."""
@@ -213,6 +219,8 @@ class Part:
     """Fields that the part keeps from step to step, as arrays of the state."""
     shares: tuple[str, ...] = ()
     """Parameters to whose adjoints every particle adds a term; see `Force.shares`."""
+    derivatives: tuple[type[PartTangent], type[PartAdjoint]] | None = None
+    """Classes of the part's tangent and adjoint, made of the part; None if the part has none or makes them itself."""
 
     def set_substeps(self, substeps: int) -> None:
         """Take this number of substeps of diffusion in each later step."""
@@ -238,11 +246,19 @@ class Part:
 
     def new_tangent(self) -> PartTangent:
         """Make the tangent of the part, with its arrays; raise `MissingDerivativeError` without forward mode."""
-        raise MissingDerivativeError(f"{type(self).__name__} has no forward mode: let it have a method new_tangent.")
+        if self.derivatives is None:
+            raise MissingDerivativeError(
+                f"{type(self).__name__} has no forward mode: let it have a method new_tangent."
+            )
+        return self.derivatives[0](self)
 
     def new_adjoint(self) -> PartAdjoint:
         """Make the adjoint of the part, with its arrays; raise `MissingDerivativeError` without reverse mode."""
-        raise MissingDerivativeError(f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint.")
+        if self.derivatives is None:
+            raise MissingDerivativeError(
+                f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint."
+            )
+        return self.derivatives[1](self)
 
 
 class PartMaker(Protocol):

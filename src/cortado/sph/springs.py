@@ -26,19 +26,35 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.device.modules import Kernels, kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.particles.moving_walls import resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.particles.state import Layout, Parameters, padded
+from cortado.particles.state import Layout, Parameters, zeros
 from cortado.scene.hinges import Joint
 from cortado.scene.springs import Ends
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 TAUT = 0.01
-OWN = ("before", "turns_before", "after", "turns")
 NUMBERS = ("stiffness", "rest_length", "damping")
 TURNING = ("stiffness", "rest_angle", "damping", "torque", "speed")
+POSES = (
+    ("c_0", "e_0", "before", "before"),
+    ("R_0", "E_0", "turns_before", "turned_before"),
+    ("c", "e", "after", "after"),
+    ("R", "E", "turns", "turned"),
+)
+"""Middles and rotations before and after a step: names in kernels for the body and for the other solid, and names of
+the arrays (`cortado.particles.moving_walls`) and of their changes."""
+TURNED = {name: f"{name}_turn" for name in ("R_0", "R", "E_0", "E")}
+
+
+@cache
+def constants_types(precision: Precision) -> tuple[Any, Any]:
+    """Return the Warp structs of the constants of a spring and of a hinge."""
+    vector, matrix, both = precision.vector, precision.matrix, {"is_free": wp.bool}
+    spring, hinge = {"own": vector, "anchor": vector, "slack": wp.bool}, {"begun": matrix, "other_begun": matrix}
+    return struct_of("Spring", precision, **spring, **both), struct_of("Hinge", precision, axis=vector, **hinge, **both)
 
 
 @cache
@@ -46,9 +62,9 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
     """Make the kernels of springs and hinges, with a thread for each scene: the momenta by a spring, its force and
     length as components of a vector, and the angular momentum by a hinge."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
+    (spring_of, hinge_of), kinds = constants_types(precision), {vector: "c_0 c e_0 e W", matrix: "R_0 R E_0 E"}
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
-    places = "before after other_before other_after own anchor"
-    typed = TypesByName(real, {vector: places, matrix: "turns other_turns", bool: "slack is_free"})
+    typed = TypesByName(real, {**kinds, spring_of: "spring", hinge_of: "hinge"})
 
     @wp.func
     def tension(k: real, rest: real, c: real, dt: real, d: vector, moved: vector, slack: bool) -> real:
@@ -63,104 +79,49 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
     @typed
     def pull(
-        time_step_i,
-        stiffness_i,
-        rest_length_i,
-        damping_i,
-        before_i,
-        turns_before_i,
-        after_i,
-        turns_i,
-        other_before_i,
-        other_turns_before_i,
-        other_after_i,
-        other_turns_i,
-        own,
-        anchor,
-        cell,
-        slack,
-        is_free,
+        time_step_i, stiffness_i, rest_length_i, damping_i, c_0_i, R_0_i, c_i, R_i, e_0_i, E_0_i, e_i, E_i, spring, cell
     ) -> tuple[vector, vector, vector, vector]:
-        arm, other_arm = turns_before_i * own, other_turns_before_i * anchor
-        d = other_before_i + other_arm - before_i - arm
-        moved = other_after_i + other_turns_i * anchor - after_i - turns_i * own - d
-        t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, slack)
+        arm, other_arm = R_0_i * spring.own, E_0_i * spring.anchor
+        d = e_0_i + other_arm - c_0_i - arm
+        moved = e_i + E_i * spring.anchor - c_i - R_i * spring.own - d
+        t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, spring.slack)
         P = (time_step_i * t / (cell * wp.sqrt(wp.dot(d, d) + tiny))) * d
-        against = wp.where(is_free, -one, no)
+        against = wp.where(spring.is_free, -one, no)
         return P, wp.cross(arm, P), against * P, against * wp.cross(other_arm, P)
 
     @typed
     def read(
-        time_step_i,
-        stiffness_i,
-        rest_length_i,
-        damping_i,
-        before_i,
-        turns_before_i,
-        after_i,
-        turns_i,
-        other_before_i,
-        other_turns_before_i,
-        other_after_i,
-        other_turns_i,
-        own,
-        anchor,
-        slack,
+        time_step_i, stiffness_i, rest_length_i, damping_i, c_0_i, R_0_i, c_i, R_i, e_0_i, E_0_i, e_i, E_i, spring
     ) -> vector:
-        d = other_before_i + other_turns_before_i * anchor - before_i - turns_before_i * own
-        moved = other_after_i + other_turns_i * anchor - after_i - turns_i * own - d
-        t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, slack)
+        d = e_0_i + E_0_i * spring.anchor - c_0_i - R_0_i * spring.own
+        moved = e_i + E_i * spring.anchor - c_i - R_i * spring.own - d
+        t = tension(stiffness_i, rest_length_i, damping_i, time_step_i, d, moved, spring.slack)
         return vector(t, wp.sqrt(wp.dot(d, d) + tiny), no)
 
     @wp.func
     def about(Q: matrix) -> vector:
         return vector(Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1])
 
-    matrices = "turns_before other_turns_before other_turns begun other_begun"
-
-    @TypesByName(real, {vector: "W axis", matrix: matrices, bool: "is_free"})
+    @typed
     def twist(
-        time_step_i,
-        stiffness_i,
-        rest_angle_i,
-        damping_i,
-        torque_i,
-        speed_i,
-        turns_before_i,
-        W_i,
-        other_turns_before_i,
-        other_turns_i,
-        axis,
-        begun,
-        other_begun,
-        cell,
-        is_free,
+        time_step_i, stiffness_i, rest_angle_i, damping_i, torque_i, speed_i, R_0_i, W_i, E_0_i, E_i, hinge, cell
     ) -> tuple[vector, vector]:
-        P = other_turns_before_i * wp.transpose(other_begun)
-        Q, a = wp.transpose(P) * turns_before_i * wp.transpose(begun), P * axis
-        angle = wp.atan2(wp.dot(axis, about(Q)), Q[0, 0] + Q[1, 1] + Q[2, 2] - one)
-        turned = about(other_turns_i * wp.transpose(other_turns_before_i)) / (real(2.0) * time_step_i)
+        P = E_0_i * wp.transpose(hinge.other_begun)
+        Q, a = wp.transpose(P) * R_0_i * wp.transpose(hinge.begun), P * hinge.axis
+        angle = wp.atan2(wp.dot(hinge.axis, about(Q)), Q[0, 0] + Q[1, 1] + Q[2, 2] - one)
+        turned = about(E_i * wp.transpose(E_0_i)) / (real(2.0) * time_step_i)
         rate = wp.dot(a, W_i - turned) - speed_i
         torque = torque_i - stiffness_i * (angle - rest_angle_i) - damping_i * rate
         found = (time_step_i * torque / cell) * a
-        return found, wp.where(is_free, -one, no) * found
+        return found, wp.where(hinge.is_free, -one, no) * found
 
     modules = [kernel_module(f"springs_derivative_{precision.name}")] * 3
-    poses = [*OWN, *(f"other_{name}" for name in OWN)]
-    turned = {"turns": "turned", "turns_before": "turned_before"}
-    turned |= {f"other_{name}": f"other_{turn}" for name, turn in turned.items()}
-    ends = ["own", "anchor", "slack"]
     given = [f"{name}:{name}" for name in ("pushed", "twisted", "pushed_other", "twisted_other")]
-    pulls = pointwise_kernels(
-        precision, modules, lambda _: pull, given, numbers=[*ends, "cell", "is_free"], written=poses, turned=turned
-    )
-    reads = pointwise_kernels(
-        precision, modules, lambda _: read, ["reading"], numbers=ends, written=poses, turned=turned
-    )
-    names: dict[str, Any] = {"numbers": ["axis", "begun", "other_begun", "cell", "is_free"], "turned": turned}
-    names |= {"written": ["turns_before", "other_turns_before", "other_turns"], "told": ["torque", "speed"]}
-    results = ["twisted:twisted", "twisted_other:twisted_other"]
-    twists = pointwise_kernels(precision, modules, lambda _: twist, results, **names)
+    names: dict[str, Any] = {"written": [*"cReE", "c_0", "R_0", "e_0", "E_0"], "turned": TURNED}
+    pulls = pointwise_kernels(precision, modules, lambda _: pull, given, numbers=["spring", "cell"], **names)
+    reads = pointwise_kernels(precision, modules, lambda _: read, ["reading"], numbers=["spring"], **names)
+    names = {"written": ["R_0", "E_0", "E"], "told": ["torque", "speed"], "numbers": ["hinge", "cell"]}
+    twists = pointwise_kernels(precision, modules, lambda _: twist, given[1::2], turned=TURNED, **names)
     return pulls, reads, twists
 
 
@@ -168,38 +129,43 @@ class Springs:
     def __init__(self, part: FreeSolidsPart, springs: Sequence[Ends], turned: Sequence[Joint], layout: Layout):
         self.part, self.springs, self.turned, self.layout = part, springs, turned, layout
         self.pull, self.read, self.twist = spring_kernels(layout.precision)
-        self.vectors = {"dtype": layout.precision.vector, "device": layout.device}
         self._rest = resting_pose(layout)
 
     def ends(self, of: Ends | Joint) -> Named:
+        """Return the poses of both solids, and their tangents, by the names of kernel arguments."""
+        found: dict[str, wp.array] = {}
         each = self.part.made_of.walls.each
-        other = self._rest if of.against < 0 else each[of.against]
-        return {**each[self.number(of.body)], **{f"other_{name}": array for name, array in other.items()}}
+        pose, other_pose = each[self.number(of.body)], self._rest if of.against < 0 else each[of.against]
+        for own, other, name, change in POSES:
+            found |= {own: pose[name], f"{TURNED.get(own, own)}_dot": pose[f"{change}_dot"]}
+            found |= {other: other_pose[name], f"{TURNED.get(other, other)}_dot": other_pose[f"{change}_dot"]}
+        return found
 
-    def poses(self, spring: Ends) -> tuple[Named, ...]:
-        vector = self.layout.precision.vector
-        own, anchor = (vector(*padded(place[None])[0]) for place in (spring.point, spring.anchor))
-        return self.ends(spring), {"own": own, "anchor": anchor, "slack": spring.slack, "is_free": spring.other >= 0}
+    def known(self, of: Ends | Joint) -> tuple[Named, ...]:
+        """Return the kernel arguments of a spring or hinge other than its parameters."""
+        precision, (spring_of, hinge_of) = self.layout.precision, constants_types(self.layout.precision)
+        if isinstance(of, Ends):
+            spring = spring_of()
+            spring.own, spring.anchor = map(precision.vector_of, (of.point, of.anchor))
+            spring.slack, spring.is_free = of.slack, of.other >= 0
+            return self.ends(of), {"spring": spring}
+        hinge = hinge_of()
+        hinge.axis, hinge.is_free = precision.vector(*of.axis), of.other >= 0
+        hinge.begun, hinge.other_begun = (precision.matrix(*one.turn.ravel()) for one in of.begun)
+        return self.ends(of), {"hinge": hinge}, self.part.bodies[of.body].before
 
     def number(self, body: int) -> int:
         return self.part.bodies[body].table.number
-
-    def known(self, of: Joint) -> tuple[Named, ...]:
-        matrix, body = self.layout.precision.matrix, self.part.bodies[of.body]
-        begun, other_begun = (matrix(*one.turn.ravel()) for one in of.begun)
-        constants = {"axis": self.layout.precision.vector(*of.axis), "begun": begun, "other_begun": other_begun}
-        return self.ends(of), constants, {"is_free": of.other >= 0}, body.before
 
     def each(
         self, step: StepContext, bodies: Sequence[FreeBody | Changes]
     ) -> Iterator[tuple[Kernels, Ends | Joint, Sequence[str], tuple[Named, ...]]]:
         """Yield kernels, spring or hinge, names of its parameters, and kernel arguments with momenta of ``bodies``."""
-        for spring in self.springs:
-            known = numbers_of(step.parameters, spring.name, NUMBERS), *self.poses(spring)
-            yield self.pull, spring, NUMBERS, (given_to(bodies, spring.body, spring.other), *known)
-        for of in self.turned:
-            known = numbers_of(step.parameters, of.name, TURNING), *self.known(of)
-            yield self.twist, of, TURNING, (given_to(bodies, of.body, of.other), *known)
+        all_of: list[Ends | Joint] = [*self.springs, *self.turned]
+        for of in all_of:
+            kernels, ends = (self.pull, NUMBERS) if isinstance(of, Ends) else (self.twist, TURNING)
+            given = given_to(bodies, of.body, of.other)
+            yield kernels, of, ends, (given, numbers_of(step.parameters, of.name, ends), *self.known(of))
 
     def look(self, step: StepContext) -> None:
         for kernels, _, _, known in self.each(step, self.part.bodies):
@@ -228,16 +194,18 @@ class SpringsTangent:
 
 
 class PoseBars:
+    """Adjoints of the poses of both solids, by the names of kernel arguments."""
+
     def __init__(self, springs: Springs):
-        names = [f"{name}_bar" for name in ("before", "turned_before", "after", "turned")]
-        self._springs, self._names = springs, names
-        members, vectors = springs.layout.members, springs.vectors
-        self.named = {f"{way}{name}": wp.zeros(members, **vectors) for way in ("", "other_") for name in names}
+        self._springs, layout = springs, springs.layout
+        names = (TURNED.get(name, name) for own, other, *_ in POSES for name in (own, other))
+        self.named = zeros({f"{one}_bar": (layout.members, layout.precision.vector) for one in names}, layout.device)
 
     def add(self, of: Ends | Joint, bar: Adjoints) -> None:
-        for way, number in (("", self._springs.number(of.body)), ("other_", of.against)):
+        for k, number in enumerate((self._springs.number(of.body), of.against)):
             if number >= 0:
-                bar.solids.add_whole(number, **{name: self.named[f"{way}{name}"] for name in self._names})
+                names = {f"{row[3]}_bar": f"{TURNED.get(row[k], row[k])}_bar" for row in POSES}
+                bar.solids.add_whole(number, **{name: self.named[one] for name, one in names.items()})
         for array in self.named.values():
             array.zero_()
 

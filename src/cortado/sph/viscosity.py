@@ -1,8 +1,8 @@
 """The viscous force of pairs of particles (Monaghan 2005), which scenes with PCISPH may use instead of the viscous
 stress:
 
-    a_i = kappa / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
-    phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   kappa = 2 (d + 2).
+    a_i = k / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
+    phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   k = 2 (d + 2).
 
 The kernel's gradient is G = a x; functions call a the ``slope``, and 1 / (|x|^2 + 0.01 h^2) ``per_size``. A pair has
 the dynamic viscosity mu_ij = 2 mu_i mu_j / (mu_i + mu_j) [Pa s], which keeps the shear stress continuous between fluids
@@ -95,52 +95,37 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     typed = TypesByName(real, {vector: "x v bar", neighbourhood: "s"})
 
     @typed
-    def wall_force(x_ij, v_ij, n_i, m_i, mu_i, kappa, s) -> vector:
-        return (kappa * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
+    def wall_force(x_ij, v_ij, n_i, m_i, mu_i, k, s) -> vector:
+        return (k * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
     @rubbing_sum(discretisation, sticks)(wall_force)
     @typed
-    def force(x_ij, v_ij, n_i, n_j, m_i, mu_i, mu_j, kappa, s) -> vector:
+    def force(x_ij, v_ij, n_i, n_j, m_i, mu_i, mu_j, k, s) -> vector:
         weight = pair_viscosity(mu_i, mu_j) * reciprocal(n_j)
-        return (kappa * s.volume / (m_i * n_i) * weight) * phi_force(x_ij, v_ij, s)
+        return (k * s.volume / (m_i * n_i) * weight) * phi_force(x_ij, v_ij, s)
 
     @tangent_of(force)
     @fluid_sum(discretisation, ahead=False)
     @typed
     def force_tangent(
-        x_ij,
-        x_dot_ij,
-        v_ij,
-        v_dot_ij,
-        n_i,
-        n_j,
-        n_dot_i,
-        n_dot_j,
-        m_i,
-        m_dot_i,
-        mu_i,
-        mu_j,
-        mu_dot_i,
-        mu_dot_j,
-        kappa,
-        s,
+        x_ij, x_dot_ij, v_ij, v_dot_ij, n_i, n_j, n_dot_i, n_dot_j, m_i, m_dot_i, mu_i, mu_j, mu_dot_i, mu_dot_j, k, s
     ) -> vector:
         mu_ij = pair_viscosity(mu_i, mu_j)
         own = pair_viscosity_derivative(mu_i, mu_j) * mu_dot_i
         mu_dot_ij = own + pair_viscosity_derivative(mu_j, mu_i) * mu_dot_j
         change = mu_dot_ij - mu_ij * (m_dot_i / m_i + n_dot_i / n_i + n_dot_j / n_j)
         total = change * phi_force(x_ij, v_ij, s) + mu_ij * phi_tangent(x_ij, v_ij, x_dot_ij, v_dot_ij, s)
-        return (kappa * s.volume / (m_i * n_i * n_j)) * total
+        return (k * s.volume / (m_i * n_i * n_j)) * total
 
     @adjoint_of(force)
     @fluid_sum(discretisation)
     @typed
     def force_adjoint(
-        x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, kappa, s
+        x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, k, s
     ) -> tuple[vector, vector, real, real, real]:
         w_i = bar_i * reciprocal(m_i)
         w_ij = w_i - bar_j * reciprocal(m_j)
-        per_volume = kappa * s.volume * reciprocal(n_i) * reciprocal(n_j)
+        per_volume = k * s.volume * reciprocal(n_i) * reciprocal(n_j)
         weight = per_volume * pair_viscosity(mu_i, mu_j)
         pushed = phi_force(x_ij, v_ij, s)
         work = wp.dot(pushed, w_ij)
@@ -152,7 +137,7 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     sums = force, force_tangent, force_adjoint
     return sum_kernels(
-        "viscosity", discretisation.modules(name), sums, "acceleration", before="acceleration_in", numbers=["kappa"]
+        "viscosity", discretisation.modules(name), sums, "acceleration", before="acceleration_in", numbers=["k"]
     )
 
 
@@ -179,10 +164,10 @@ class Viscosity:
 
     def __init__(self, setting: Setting):
         discretisation, self.sticks = setting.discretisation, setting.scene.sticks
-        kappa = 2.0 * (setting.scene.dimension + 2)
+        k = 2.0 * (setting.scene.dimension + 2)
         self._kernels = viscosity_kernels(discretisation, self.sticks)
-        self._constants: dict[str, Any] = {"kappa": kappa}
-        action = WallSums(viscosity_term(discretisation), setting.layout, (kappa, 0.0))
+        self._constants: dict[str, Any] = {"k": k}
+        action = WallSums(viscosity_term(discretisation), setting.layout, (k, 0.0))
         self.wall_action = action if self.sticks else None
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:

@@ -6,7 +6,7 @@ M and mu of the velocities at the start. The acceleration at the end of a step i
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which `cortado.sph.moment_functions` solves to round-off. B is symmetric and positive in the product sum_i m_i a_i .
+which `cortado.sph.viscous_solve` solves to round-off. B is symmetric and positive in the product sum_i m_i a_i .
 b_i. The viscosity mu belongs to the velocities v at the start, the stress to u = v + dt a' at the end. Derivatives are
 those of the exact solution: tangent and adjoint are one more solve with B each.
 """
@@ -26,20 +26,19 @@ from cortado.device.precision import Precision
 from cortado.device.reduction import add
 from cortado.discretise.smoothing import stress_control
 from cortado.errors import MissingDerivativeError
-from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.particle_kernels import over, particle_kernel
-from cortado.particles.state import Layout
+from cortado.particles.particle_kernels import particle_kernel
 from cortado.particles.wall_terms import WallTerm, WorkMaker, solid_kernel
 from cortado.scene.parameters import Parameter
 from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
 from cortado.sph.density import WallSums
-from cortado.sph.formula import Packed, compiled
+from cortado.sph.formula import compiled
 from cortado.sph.free_friction import FreeFriction
-from cortado.sph.moment_functions import ConjugateGradients, round_off
+from cortado.sph.own_arrays import OwnParameters
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_sums, stress_work
-from cortado.sph.stress_kernels import moment_sums, moments_work, stress_kernels, traction_function
+from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_work
+from cortado.sph.stress_kernels import moments_work, stress_kernels
+from cortado.sph.viscous_solve import Solve, operator_kernels
 
 CLOSEST = 0.25
 """In spacings: distance below which the pull of walls without slip is constant (`cortado.sph.stress_forces`)."""
@@ -60,7 +59,7 @@ class ViscousStress:
         control = stress_control(discretisation.smoothing, cut.spacing, cut.support_radius, scene.dimension)
         self.constants: dict[str, Any] = {"control": control, "least": CLOSEST * cut.spacing}
         self.free = FreeFriction(setting, self.constants)
-        self._packed = Packed(parameters, layout, discretisation.taped)
+        self._own = OwnParameters(parameters, layout, discretisation.taped)
         self._of = self.arrays("M", "A", "R", "T", "eta", taped=discretisation.taped)
         self._change = self.arrays("M", "A", "A_u", "R", "T", "eta")
         sums = (stress_work, "acceleration_bar", "rub"), (stress_couple_work, "couple_bar", "couple")
@@ -87,8 +86,8 @@ class ViscousStress:
         self.free.begin(step)
         step.launch(self._kernels.moments.forward, self.constants, self._of)
         self.free.gather(step, self._of)
-        known = {"A_u": self._of["A"], "theta": self._packed.theta(step)}
-        step.launch(self._kernels.stress.forward, known, self.constants, self._of)
+        known = self._own.now(step), {"A_u": self._of["A"]}, self.constants, self._of
+        step.launch(self._kernels.stress.forward, *known)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         known = self._stress_along(step, dot), *dot.named, self.constants, self._of
@@ -106,8 +105,7 @@ class ViscousStress:
         step.launch(self._kernels.moments.tangent, change, *known)
         free.gather(step, dot, change)
         resisted = resisted or {"A_u": self._of["A"], "A_u_dot": change["A_dot"]}
-        theta = {"theta": self._packed.theta(step), "theta_dot": self._packed.theta_dot(step, dot.parameters)}
-        step.launch(self._kernels.stress.tangent, theta, resisted, change, *known)
+        step.launch(self._kernels.stress.tangent, self._own.along(step, dot.parameters), resisted, change, *known)
         return change
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
@@ -130,8 +128,8 @@ class ViscousStress:
         """Turn the adjoints of T and mu into adjoints of the sums, and these into adjoints of particles and solids.
         ``now`` has the arrays of `resisted`, ``bars`` those of the adjoints of M, R, A and A_u and of the resisted
         velocities."""
-        theta = {"theta": self._packed.theta(step), "theta_bar": self._packed.shares}
-        step.launch(self._kernels.stress.adjoint, theta, bars, now, *bar.named, self.constants, self._of)
+        known = self._own.back(step), bars, now, *bar.named, self.constants, self._of
+        step.launch(self._kernels.stress.adjoint, *known)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
         if at_the_start:
             add(bars["A_bar"], A_bar)
@@ -140,7 +138,7 @@ class ViscousStress:
         self.free.bars.gather(step, bar, {name: bars[name] for name in ("M_bar", "A_bar", "R_bar")})
         if not (at_the_start or self._law.is_newtonian):
             self._back_to_particles(step, bar, {"A_bar": bars["A_bar"]}, self._no_bars)
-        self._packed.collect(step, bar)
+        self._own.collect(step, bar)
 
     def _back_to_particles(self, step: StepContext, bar: Adjoints, *known: Named) -> None:
         step.launch(self._kernels.moments.adjoint, *known, *bar.named, self.constants)
@@ -209,30 +207,6 @@ class StressWalls:
 
 
 @cache
-def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Any, Any]:
-    precision = discretisation.precision
-    real, vector, matrix = precision.real, precision.vector, precision.matrix
-    module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
-    traction = traction_function(precision, dimension, module)
-    moments, force = moment_sums(discretisation, sticks).forward, stress_sums(discretisation, sticks).force
-    constants = ["control", "least"]
-
-    @particle_kernel(module, "A T", [over(moments, "diagonal others row_x row_y row_z thin")], numbers=constants)
-    def pull(
-        row_x: vector, row_y: vector, row_z: vector, control: real, M_i: matrix, eta_i: real
-    ) -> tuple[matrix, matrix]:
-        A = wp.matrix_from_rows(row_x, row_y, row_z)
-        return A, traction(M_i, A, eta_i, control)
-
-    @particle_kernel(module, "product share", [over(force, "total", mu="eta")], numbers=constants)
-    def multiply(total: vector, time_step: real, v_i: vector, m_i: real) -> tuple[vector, real]:
-        found = v_i - time_step * total
-        return found, m_i * wp.dot(v_i, found)
-
-    return pull, multiply
-
-
-@cache
 def implicit_kernels(precision: Precision) -> SimpleNamespace:
     real, vector, module = precision.real, precision.vector, kernel_module(f"implicit_step_derivative_{precision.name}")
 
@@ -254,35 +228,6 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
         return u_bar_i, wp.dot(u_bar_i, acceleration_i)
 
     return by_name(predict, weigh, unweigh, end_adjoint)
-
-
-MOST = 1_000
-
-
-class Solve(ConjugateGradients):
-    name, most = "viscous_iterations", MOST
-
-    def __init__(self, layout: Layout, operator: tuple[Any, Any], free: FreeFriction):
-        precision = layout.precision
-        super().__init__(layout, precision.vector, round_off(precision), MOST)
-        (self._pull, self._multiply), self._free = operator, free
-
-    def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
-        """Solve B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of B's kernels."""
-
-        self.solve(step, partial(self._apply, step, known), step.fields["m"], r, y, self._free.rows)
-
-    def _apply(self, step: StepContext, known: Any, p: wp.array, found: Named) -> None:
-        step.launch(self._pull, *known, v=p)
-        self._free.lean(step, known, p)
-        step.launch(self._multiply, *known, found, v=p)
-        self._free.multiply(step, known, p, found)
-
-    def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add to ``r`` the product of B with velocities of bodies alone; ``still`` are zero velocities of particles."""
-        found = {name: self._own[name] for name in ("product", "share")}
-        self._apply(step, known, still, found)
-        add(found["product"], r)
 
 
 class ImplicitViscousStress(ViscousStress):
@@ -313,12 +258,9 @@ class ImplicitViscousStress(ViscousStress):
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         self._measure(step)
-        step.launch(self._implicit.predict, acceleration=before, u=self._u)
-        self.free.hang(step, self._u)
-        known = self._known()
         self.free.start(step)
-        step.launch(self._pull, *known, v=self._u)
-        self.free.pull(step, *known, v=self._u)
+        self._find_end(step, before)
+        known = self._known()
         step.launch(self._kernels.force.forward, *known, v=self._u, acceleration_in=self._still, acceleration=self._r)
         self.free.push(step, *known, v=self._u, acceleration=self._r)
         self.solve(step, known, self._r, self._y)
@@ -327,15 +269,15 @@ class ImplicitViscousStress(ViscousStress):
         add(self._y, after)
         self._after = after
 
-    def _find_end(self, step: StepContext) -> None:
-        """Write the velocities u = v + dt a' at the end of the step, and their A and T."""
-        step.launch(self._implicit.predict, acceleration=self._after, u=self._u)
+    def _find_end(self, step: StepContext, acceleration: wp.array) -> None:
+        """Write the velocities u = v + dt a at the end of the step, and their A and T."""
+        step.launch(self._implicit.predict, acceleration=acceleration, u=self._u)
         self.free.hang(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)
         self.free.pull(step, *self._known(), v=self._u)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        self._find_end(step)
+        self._find_end(step, self._after)
         u_dot, along = self._y, {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}
         step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
         self.free.dots.hang(step, dot, u_dot)
@@ -352,11 +294,11 @@ class ImplicitViscousStress(ViscousStress):
         return {"v": self._u, "v_dot": u_dot, "A_u": self._at_end["A"]}
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
-        self._find_end(step)
+        self._find_end(step, self._after)
         return {"T": self._at_end["T"], "eta": self._of["eta"], "A_u": self._at_end["A"], "v": self._u}
 
     def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
-        self._find_end(step)
+        self._find_end(step, self._after)
         by_time, u_dot = {"v": dot.fields["v"], "time_step": dot.parameters["time_step"]}, self._y
         step.launch(self._implicit.predict, by_time, acceleration=self._after, u=self._r)
         step.launch(self._implicit.predict, v=self._r, acceleration=self._after_dot, u=u_dot)
@@ -382,8 +324,7 @@ class ImplicitViscousStress(ViscousStress):
         u_bar.zero_()
         self.free.bars.begin(step, bar)
         self._back(step, bar, self._r, now, u_bar)
-        step.launch(self._implicit.end_adjoint, {"u_bar": u_bar, "acceleration": self._after}, *bar.named)
-        self.free.bars.finish(step, bar, u_bar)
+        self.resisted_adjoint(step, u_bar, bar, bar.fields["v"])
         return self._r
 
 
