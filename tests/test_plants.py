@@ -37,7 +37,7 @@ UNNAMED = {
     "particles.wall_terms": {"solid_kernel.share"},
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},
     "sph.density": {"_density_work.density_work", "_work.wall_slope_work"},
-    "sph.own_arrays": {"packing_kernels.add"},
+    "sph.formula": {"packing_kernels.add"},
     "sph.stress_kernels": {*("moments_work.moments_work", "moment_sums.moments_back", "moment_sums.wall_moments_back")},
     "sph.stress_forces": {
         *("stress_sums.traction_back", "stress_sums.wall_traction_back"),

@@ -226,17 +226,11 @@ class SolidPose:
         if self.rotation is not None:
             if self.rotation.shape != (2 * end.dimension - 3,):
                 raise InputError(f"rotation has shape {self.rotation.shape}, but must be {(2 * end.dimension - 3,)}.")
-            more, of_fields = self._turned(end)
-            value, bars = value + more, {**bars, **of_fields}
+            pose = Pose.of(name, f"{name}.{AXES[0]}" in names, end)
+            R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
+            value += weight * float(3.0 - np.trace(wanted.T @ R))
+            bars |= pose.turning_bars(-weight * np.cross(R, wanted, axis=0).sum(axis=1))
         return value, bars
-
-    def _turned(self, end: Snapshot) -> tuple[float, dict[str, np.ndarray]]:
-        """Return the term of rotation, and its adjoint by field."""
-        assert self.rotation is not None
-        pose = Pose.of(self.name, f"{self.name}.{AXES[0]}" in end.state.names, end)
-        R, wanted, weight = pose.rotation, matrix(self.rotation), self.length**2
-        t = -weight * np.cross(R, wanted, axis=0).sum(axis=1)
-        return weight * float(3.0 - np.trace(wanted.T @ R)), pose.turning_bars(t)
 
 
 class Pictures(Protocol):

@@ -21,7 +21,7 @@ from cortado.device.cells import CellSort, cell_grid_type
 from cortado.device.grid import Grid
 from cortado.device.launching import bundle, launch
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.discretise.shapes import Rows
 from cortado.particles.state import Layout, zeros
 
@@ -83,15 +83,8 @@ def turn_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def sizes_type(precision: Precision) -> Any:
-    real = precision.real
-
-    class Sizes:
-        scales: wp.array2d(dtype=real)
-        scales_dot: wp.array2d(dtype=real)
-        power: real
-
-    Sizes.__name__ = Sizes.__qualname__ = f"Sizes_{precision.name}"
-    return wp.struct(Sizes)
+    scales = wp.array2d(dtype=precision.real)
+    return struct_of("Sizes", precision, scales=scales, scales_dot=scales, power=precision.real)
 
 
 @cache

@@ -280,7 +280,7 @@ class Kinds:
     turned: Mapping[str, str] = field(default_factory=dict)
     """Rotations, with the names of their further turns."""
     read: Mapping[str, str] = field(default_factory=dict)
-    """Parameters by which a function reads a table (`cortado.sph.own_arrays`), with their source texts in a kernel. The
+    """Parameters by which a function reads a table (`cortado.sph.formula`), with their source texts in a kernel. The
     adjoint kernel then has ``rows`` threads for each scene, which loop over particles."""
 
 

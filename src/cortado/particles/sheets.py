@@ -21,7 +21,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.discretise.sheet import Sheet
 from cortado.discretise.tree_kernels import face_functions, faces_on, faces_type
 from cortado.particles.mirrors import CONTAINER, reflections
@@ -40,14 +40,8 @@ class PlacedSheet:
 
 @cache
 def sheets_type(precision: Precision) -> Any:
-
-    class Sheets:
-        faces: faces_type(precision)
-        """Edges or triangles of the sheets: of moving sheets in the frames of their solids."""
-        numbers: wp.array(dtype=wp.int32)
-
-    Sheets.__name__ = Sheets.__qualname__ = f"Sheets_{precision.name}"
-    return wp.struct(Sheets)
+    """Return the Warp struct of the edges or triangles of sheets: of moving sheets in the frames of their solids."""
+    return struct_of("Sheets", precision, faces=faces_type(precision), numbers=wp.array(dtype=wp.int32))
 
 
 @cache

@@ -10,7 +10,6 @@ In the adjoint, the light from behind a sample is the image minus the light summ
 the samples therefore suffices, even if they are dark.
 """
 
-from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from math import prod
 from typing import Any
@@ -66,17 +65,10 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
     return brightness, brightness_derivative
 
 
-@dataclass(frozen=True)
-class AbsorptionKernels(Kernels):
-    """Kernels that march along rays through the colour field, with their derivatives."""
-
-    gather: Any
-    """From the adjoints of samples to those of nodes."""
-
-
 @cache
-def absorption_kernels(precision: Precision) -> AbsorptionKernels:
-    """Return the ray marching kernels: ``forward``, ``tangent`` and ``adjoint`` over pixels, ``gather`` over nodes."""
+def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
+    """Return the kernels over pixels that march along rays through the colour field, and the kernel over nodes from the
+    adjoints of samples to those of nodes."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     change = camera_tangent_type(precision)
@@ -201,7 +193,7 @@ def absorption_kernels(precision: Precision) -> AbsorptionKernels:
                     total += trilinear_weight(o + distance(s, camera) * d, x_g, nodes) * samples_bar[s - span[0], pixel]
         field_bar[k, j, i] = total
 
-    return AbsorptionKernels(march, march_tangent, march_adjoint, gather)
+    return Kernels(march, march_tangent, march_adjoint), gather
 
 
 def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
@@ -232,7 +224,7 @@ class RayMarcher:
         self._step = step = nodes.cell / SAMPLES_PER_CELL
         self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
-        self._kernels = absorption_kernels(precision)
+        self._kernels, self._gather = absorption_kernels(precision)
         self._zeros = partial(wp.zeros, device=device)
         self._ink, self._pose = rgba_type(precision), pose_type(precision)
         self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
@@ -262,7 +254,7 @@ class RayMarcher:
         self._image_bar.assign(image_bar)
         bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
         launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)
-        launch(self._kernels.gather, field.shape, self._device, self._known, bars, field_bar=self._field_bar)
+        launch(self._gather, field.shape, self._device, self._known, bars, field_bar=self._field_bar)
         return self._field_bar, self._sum(self._pose_bar).numpy()[0].astype(np.float64)
 
     @cached_property

@@ -12,7 +12,7 @@ import warp as wp
 
 from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.modules import kernel_module
-from cortado.device.precision import Precision, TypesByName
+from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.discretise.room import TOLERANCE
 from cortado.discretise.shapes import Points
 from cortado.particles.moving_walls import MovingWalls, pose_arrays
@@ -25,53 +25,27 @@ NO_PARTICLE = 2**31 - 1
 
 @cache
 def bounds_type(precision: Precision) -> Any:
-    real, vector = precision.real, precision.vector
-
-    class Bounds:
-        lower: vector
-        upper: vector
-        base: vector
-        across: vector
-        up: vector
-        """Unit vector along the axis of an open cup; 0 for other containers."""
-        radius: real
-        rim: real
-        nearest: vector
-        """``nearest`` and ``furthest`` are corners of the box that particles must not leave."""
-        furthest: vector
-
-    Bounds.__name__ = Bounds.__qualname__ = f"Bounds_{precision.name}"
-    return wp.struct(Bounds)
+    """Return the Warp struct of a container. ``up`` is the unit vector along the axis of an open cup, and 0 for others;
+    ``nearest`` and ``furthest`` are corners of the box that particles must not leave."""
+    real = precision.real
+    vectors = dict.fromkeys(("lower", "upper", "base", "across", "up", "nearest", "furthest"), precision.vector)
+    return struct_of("Bounds", precision, **vectors, radius=real, rim=real)
 
 
 @cache
 def solids_type(precision: Precision) -> Any:
+    """Return the Warp struct of solids and their ``meshes``, of which ``still`` are at rest and come first. ``middles``
+    are the centres of meshes [m]: in space for solids at rest, in the solid's frame for moving solids. ``sides`` is 1
+    where fluid is outside of a mesh and -1 where it is inside. Arrays (members, solids): poses of moving solids before
+    and after a step, and ``scales``, by which solids are larger than their meshes. ``period`` [m] and its inverse
+    ``frequency`` are 0 along an axis that is not periodic."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
-
-    class Solids:
-        meshes: wp.array(dtype=wp.uint64)
-        still: wp.int32
-        """Number of solids at rest, which come first."""
-        middles: wp.array(dtype=vector)
-        """Centres of meshes [m]: in space for solids at rest, in the solid's frame for moving solids."""
-        before: wp.array2d(dtype=vector)
-        """(members, solids) middles of moving solids before a step [m]."""
-        turns_before: wp.array2d(dtype=matrix)
-        after: wp.array2d(dtype=vector)
-        turns: wp.array2d(dtype=matrix)
-        scales: wp.array2d(dtype=real)
-        """(members, solids) factors by which solids are larger than their meshes."""
-        sides: wp.array(dtype=real)
-        """1 where fluid is outside of a mesh, -1 where it is inside."""
-        tolerances: wp.array(dtype=real)
-        reach: wp.float32
-        period: vector
-        """[m], 0 along an axis that is not periodic."""
-        frequency: vector
-        """1 / period [1 / m], or 0."""
-
-    Solids.__name__ = Solids.__qualname__ = f"Solids_{precision.name}"
-    return wp.struct(Solids)
+    meshes = {"meshes": wp.array(dtype=wp.uint64), "still": wp.int32, "middles": wp.array(dtype=vector)}
+    poses = dict.fromkeys(("before", "after"), wp.array2d(dtype=vector))
+    poses |= dict.fromkeys(("turns_before", "turns"), wp.array2d(dtype=matrix)) | {"scales": wp.array2d(dtype=real)}
+    numbers, periods = wp.array(dtype=real), {"period": vector, "frequency": vector}
+    own = {"sides": numbers, "tolerances": numbers, "reach": wp.float32}
+    return struct_of("Solids", precision, **meshes, **poses, **own, **periods)
 
 
 @cache

@@ -38,9 +38,8 @@ from cortado.scene.courses import Knots
 from cortado.scene.parameter_values import TIME, Arrays
 from cortado.scene.parameters import Axis, Parameter, Source
 from cortado.scene.scene import Scene
-from cortado.sph.formula import Formula, applied, compiled, formula
+from cortado.sph.formula import READ_AS, Formula, OwnParameters, applied, compiled, formula, theta_of
 from cortado.sph.function_text import keep_source, plain_function, source_of
-from cortado.sph.own_arrays import READ_AS, OwnParameters, theta_of
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, check_law
 from cortado.sph.stress_kernels import VelocityGradients, gradient_functions

@@ -31,9 +31,8 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
-from cortado.sph.formula import Formula, applied, formula
+from cortado.sph.formula import Formula, applied, formula, theta_of
 from cortado.sph.function_text import plain_function
-from cortado.sph.own_arrays import theta_of
 
 
 @cache

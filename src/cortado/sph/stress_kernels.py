@@ -48,8 +48,8 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
+from cortado.sph.formula import theta_of
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
-from cortado.sph.own_arrays import theta_of
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, work_types
 

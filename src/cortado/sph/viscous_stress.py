@@ -32,9 +32,8 @@ from cortado.scene.parameters import Parameter
 from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
 from cortado.sph.density import WallSums
-from cortado.sph.formula import compiled
+from cortado.sph.formula import OwnParameters, compiled
 from cortado.sph.free_friction import FreeFriction
-from cortado.sph.own_arrays import OwnParameters
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_work
 from cortado.sph.stress_kernels import moments_work, stress_kernels
