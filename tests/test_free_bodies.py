@@ -12,7 +12,7 @@ from cortado.gradients import Tape
 from cortado.losses import CentreOfMass, SolidPose
 from cortado.runs.frames import posed
 from cortado.scene.solid_shapes import AnySolid
-from cortado.solvers.contact_kernels import STIFFNESS
+from cortado.solvers.contacts import STIFFNESS
 from floating_bodies import disc_in_a_round_tank, floating_box
 from reference_projection import Projection
 from scenes import box, pool, thrown

@@ -32,7 +32,7 @@ UNNAMED = {
     },
     "solvers.projection.wall_sums": {"beside_sums.beside_back", "beside_term.beside_work"},
     "solvers.projection.repair": {"repair_term.repair_work"},
-    "solvers.projection.body_kernels": {"body_kernels.push_back"},
+    "solvers.projection.bodies": {"body_kernels.push_back"},
     "solvers.pcisph.pressure": {"pressure_term.pressure_work"},
     "particles.wall_terms": {"solid_kernel.share"},
     "sph.viscosity": {"viscosity_term.made.viscosity_work"},

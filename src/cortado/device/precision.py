@@ -102,6 +102,10 @@ class TypesByName:
         """Add array types or Warp structs to a kernel's parameters; arrays that the kernel writes must come last."""
         return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
 
+    def kernel(self, module: Any, **options: Any) -> Callable[..., Any]:
+        """Return the decorator of a kernel in a Warp module, whose parameters get types as by `arrays`."""
+        return lambda function: wp.kernel(self.arrays(function), module=module, **options)
+
     def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
         given = function.__annotations__
         names = function.__code__.co_varnames[: function.__code__.co_argcount]

@@ -12,8 +12,6 @@ called ``swept``. If the pose of the solid changes by c', w' and g' (`MovingWall
 (x - c), images change by t(R x + o) - R t(x), and mirrored vectors by w' x R u - R (w' x u).
 """
 
-from functools import cache
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -51,8 +49,9 @@ OF_IMAGES = {
     "direct_dot": "_x_dot_i - x_dot[_j]",
     "swept": "_swept(_one, x[_j], _member, s)",
     "swept_dot": "_swept_dot(_one, x[_j], x_dot[_j], _member, s)",
-    "owned": "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))",
 }
+OWNED = "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))"
+"""1 if an image is by the walls of ``solid``, or if ``solid`` means all walls, otherwise 0."""
 
 
 def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> dict[str, Any]:
@@ -65,14 +64,8 @@ def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> 
     position, ``mirrors_in`` tests whether a wall particle belongs to these walls, and ``mirrors_by`` whether a
     reflection is by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` exist only if solids move.
     """
-    container = _container(precision, neighbourhood)
-    own = (_with_faces if moving else _without)(precision, neighbourhood, container)
-    return {one.func.__name__: one for one in (container.sides, *own)}
-
-
-@cache
-def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
-    real, vector = precision.real, precision.vector
+    real, vector, matrix = precision.real, precision.vector, precision.matrix
+    turning = matrix if moving else vector
 
     @wp.func
     def near_mirrors(x: vector, s: neighbourhood) -> int:
@@ -113,55 +106,6 @@ def _container(precision: Precision, neighbourhood: Any) -> SimpleNamespace:
     def sides(x: vector, s: neighbourhood) -> int:
         return near_mirrors(x, s) & before_mirrors(x, s)
 
-    return by_name(near_mirrors, before_mirrors, reflects, side_reflection, sides)
-
-
-def _without(precision: Precision, neighbourhood: Any, container: SimpleNamespace) -> tuple[Any, ...]:
-    vector = precision.vector
-    near_mirrors, before_mirrors, reflects = container.near_mirrors, container.before_mirrors, container.reflects
-    side_reflection = container.side_reflection
-
-    @wp.func
-    def sees(one: int, near: int, x: vector, member: int, s: neighbourhood) -> bool:
-        return reflects(one, near)
-
-    @wp.func
-    def shows(one: int, x: vector, member: int, s: neighbourhood) -> bool:
-        return reflects(one, before_mirrors(x, s))
-
-    @wp.func
-    def last_reflection(near: int, x: vector, member: int, s: neighbourhood) -> int:
-        return near
-
-    @wp.func
-    def reflection(one: int, member: int, s: neighbourhood):
-        flip, offset = side_reflection(one, s)
-        return flip, offset
-
-    @wp.func
-    def turned(flip: vector, a: vector) -> vector:
-        return wp.cw_mul(flip, a)
-
-    @wp.func
-    def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
-        return wp.where(near_mirrors(x, s) > 0, CONTAINER, NOTHING)
-
-    @wp.func
-    def mirrors_in(b: int, mirrors: int, s: neighbourhood) -> bool:
-        return s.wall_solids[b] == mirrors
-
-    @wp.func
-    def mirrors_by(one: int, solid: int, s: neighbourhood) -> bool:
-        return solid == ALL_WALLS
-
-    return sees, shows, last_reflection, reflection, turned, mirror_of, mirrors_in, mirrors_by
-
-
-def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNamespace) -> tuple[Any, ...]:
-    real, vector, matrix = precision.real, precision.vector, precision.matrix
-    near_mirrors, before_mirrors, reflects = container.near_mirrors, container.before_mirrors, container.reflects
-    side_reflection = container.side_reflection
-
     @wp.func
     def place_at(x: vector, f: int, member: int, s: neighbourhood) -> vector:
         """Return a position's distance in front of a face, and its coordinates along the face from the middle."""
@@ -185,39 +129,52 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def sees(one: int, near: int, x: vector, member: int, s: neighbourhood) -> bool:
-        if one < FACES:
-            return reflects(one, near)
-        return before_face(x, one - FACES, s.reach, member, s)
+        if wp.static(moving):  # noqa: SIM102, as Warp leaves out what is constant and false
+            if one >= FACES:
+                return before_face(x, one - FACES, s.reach, member, s)
+        return reflects(one, near)
 
     @wp.func
     def shows(one: int, x: vector, member: int, s: neighbourhood) -> bool:
-        if one < FACES:
-            return reflects(one, before_mirrors(x, s))
-        return before_face(x, one - FACES, real(1e30), member, s)
+        if wp.static(moving):  # noqa: SIM102
+            if one >= FACES:
+                return before_face(x, one - FACES, real(1e30), member, s)
+        return reflects(one, before_mirrors(x, s))
 
     @wp.func
     def last_reflection(near: int, x: vector, member: int, s: neighbourhood) -> int:
         last = int(near)
-        for f in range(s.faces):
-            if before_face(x, f, s.reach, member, s):
-                last = FACES + f
+        if wp.static(moving):
+            for f in range(s.faces):
+                if before_face(x, f, s.reach, member, s):
+                    last = FACES + f
         return last
 
     @wp.func
     def reflection(one: int, member: int, s: neighbourhood):
-        if one < FACES:
-            flip, shift = side_reflection(one, s)
-            return wp.diag(flip), shift
-        R, offset = face_reflection(one - FACES, member, s)
-        return R, offset
+        if wp.static(moving):
+            if one < FACES:
+                flip, shift = side_reflection(one, s)
+                return wp.diag(flip), shift
+            R, offset = face_reflection(one - FACES, member, s)
+            return R, offset
+        else:
+            flip, offset = side_reflection(one, s)
+            return flip, offset
 
     @wp.func
-    def turned(R: matrix, a: vector) -> vector:
-        return R * a
+    def turned(R: turning, a: vector) -> vector:
+        if wp.static(moving):
+            return R * a
+        else:
+            return wp.cw_mul(R, a)
 
     @wp.func
     def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
-        """Return 1 near the container's mirrors, plus twice the number, from 1 on, of the nearest face in reach."""
+        """Return, where solids move, 1 near the container's mirrors, plus twice the number, from 1 on, of the nearest
+        face in reach."""
+        if wp.static(not moving):
+            return wp.where(near_mirrors(x, s) > 0, CONTAINER, NOTHING)
         found, face, nearest = wp.where(near_mirrors(x, s) > 0, 1, 0), int(0), real(s.reach)
         for f in range(s.faces):
             if before_face(x, f, nearest, member, s):
@@ -227,6 +184,8 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def mirrors_in(b: int, mirrors: int, s: neighbourhood) -> bool:
+        if wp.static(not moving):
+            return s.wall_solids[b] == mirrors
         if s.wall_solids[b] == CONTAINER:
             return (mirrors & 1) == 1
         return mirrors > 1 and s.wall_faces[b] + 1 == mirrors // 2
@@ -289,9 +248,10 @@ def _with_faces(precision: Precision, neighbourhood: Any, container: SimpleNames
 
     @wp.func
     def mirrors_by(one: int, solid: int, s: neighbourhood) -> bool:
-        if one >= FACES:
-            return solid == ALL_WALLS or s.face_solids[one - FACES] == solid
+        if wp.static(moving):  # noqa: SIM102
+            if one >= FACES:
+                return solid == ALL_WALLS or s.face_solids[one - FACES] == solid
         return solid == ALL_WALLS
 
-    own = (sees, shows, last_reflection, reflection, turned, mirror_of, mirrors_in, mirrors_by)
-    return (*own, swept, image_dot, turned_dot, swept_dot)
+    own = (sides, sees, shows, last_reflection, reflection, turned, mirror_of, mirrors_in, mirrors_by)
+    return vars(by_name(*own, *((swept, image_dot, turned_dot, swept_dot) if moving else ())))

@@ -113,8 +113,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
     def surface_of(b: int, scale: real, of: own_of) -> vector:
         return scale * (of.own[b] + of.own_feet[b])
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def place(count: int, of, after, turns, sizes, x):
         j = wp.tid()
         member = j // count
@@ -122,8 +121,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         k = of.own_solids[b]
         x[j] = after[member, k] + turns[member, k] * place_of(b, sizes.scales[member, k], of)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def write(count: int, first: int, order, time_step, of, before, turns_before, turns, sizes, x, walls: walls_of):
         p = wp.tid()
         j = order[p]
@@ -142,30 +140,16 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         walls.wall_solids[first + p] = k
         walls.wall_faces[first + p] = of.own_faces[b]
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def shift(first: int, starts, shifted):
         c = wp.tid()
         shifted[c] = starts[c] + first
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def write_tangent(
-        count: int,
-        first: int,
-        order,
-        length,
-        of,
-        turns_before,
-        turns,
-        sizes,
-        before_dot,
-        turned_before_dot,
-        after_dot,
-        turned_dot,
-        wall_velocities,
-        walls: dots_of,
-    ):
+        count: int, first: int, order, length, of, turns_before, turns, sizes, before_dot, turned_before_dot,
+        after_dot, turned_dot, wall_velocities, walls: dots_of,
+    ):  # fmt: skip
         p = wp.tid()
         j = order[p]
         member = j // count

@@ -236,9 +236,7 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
     def nearest_image(x_i: vector, x_j: vector, s: neighbourhood) -> vector:
         x_ij = x_i - x_j
         turns = vector(
-            wp.round(x_ij[0] * s.frequency[0]),
-            wp.round(x_ij[1] * s.frequency[1]),
-            wp.round(x_ij[2] * s.frequency[2]),
+            wp.round(x_ij[0] * s.frequency[0]), wp.round(x_ij[1] * s.frequency[1]), wp.round(x_ij[2] * s.frequency[2])
         )
         return x_ij - wp.cw_mul(turns, s.period)
 

@@ -226,8 +226,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     scan = scan_around(discretisation)
     LANES, lane = discretisation.lanes, discretisation.lane
 
-    @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
         """List neighbours, and write to ``needed`` the greatest length in each range, even without room for it. Scenes
         with a lost particle (``bad_step`` >= 0) get empty lists."""
@@ -274,9 +273,9 @@ def image_kernel(discretisation: Discretisation) -> Any:
     load_vector, neighbour = pair.load_vector, pair.neighbour
     REFLECTIONS = wp.constant(reflections(discretisation.moving))
     LANES, lane, append = discretisation.lanes, discretisation.lane, append_function(discretisation)
+    module, typed = discretisation.module(True, "neighbours"), TypesByName(wp.int32, {neighbourhood: "s", vector: "x"})
 
-    @wp.kernel(module=discretisation.module(True, "neighbours"), enable_backward=False)
-    @TypesByName(wp.int32, {neighbourhood: "s", vector: "x"}).arrays
+    @typed.kernel(module, enable_backward=False)
     def fill_images(s, bad_step, x, all_count, needed):
         i = s.first + wp.tid() // LANES
         x_i, limit, found = x[i], s.reach * s.reach, int(s.count[i])

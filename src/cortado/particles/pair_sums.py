@@ -15,7 +15,6 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
     turn_dot           for tangents of terms of walls: the tangent of the rotation of the wall's solid
     swept, swept_dot   for images by moving solids: the displacement of the mirror in a step, and its tangent
     direct, direct_dot for images: the separation from the mirrored particle, and its tangent
-    owned              for images: 1 if the image is by the walls of ``solid``, or if ``solid`` means all walls
     s                  the neighbourhood
     any other          a value for all neighbours of a particle, which stands between the arrays and s
 
@@ -38,8 +37,8 @@ from typing import Any, get_args
 
 import warp as wp
 
-from cortado.device.precision import lane_functions, sum_over_lanes
-from cortado.particles.mirrors import OF_IMAGES, OVER_IMAGES, reflections
+from cortado.device.precision import TypesByName, lane_functions, sum_over_lanes
+from cortado.particles.mirrors import OF_IMAGES, OVER_IMAGES, OWNED, reflections
 from cortado.particles.neighbourhood import UNROLL, Discretisation, neighbourhood_type, pair_functions
 
 NUMBERS = ("i", "j")
@@ -272,13 +271,16 @@ def _lines(indent: int, lines: Iterable[str]) -> str:
 
 def _summing(
     d: Discretisation,
+    typed: TypesByName | None,
     loops: Callable[[Term, Term], str],
     walls: Function | None = None,
     module: Any = None,
     grows: Any = None,
 ) -> Decorator:
+    """Return the decorator of a sum; ``typed`` gives types to the parameters without any."""
 
     def make(function: Function) -> Any:
+        function = typed(function) if typed else function
         term, wall = Term.of(function), Term.of(walls or function)
         into = module or wp.get_module(function.__module__)
         terms = {"_term": term, "_wall_term": wall, "_grown_term": wall if grows is None else grows.wall}
@@ -291,7 +293,12 @@ def _summing(
 
 
 def pair_sum(
-    d: Discretisation, walls: Function | None = None, ahead: bool = True, rubs: bool = False, grows: Any = None
+    d: Discretisation,
+    typed: TypesByName | None = None,
+    walls: Function | None = None,
+    ahead: bool = True,
+    rubs: bool = False,
+    grows: Any = None,
 ) -> Decorator:
     """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
     ``walls`` is a separate term of walls, whose parameters the fluid's term must have. A sum that ``rubs`` excludes
@@ -301,17 +308,25 @@ def pair_sum(
         _check_walls(wall, term)
         return _over_fluid(term, d, ahead) + _over_walls(wall, d, grows, RUBBING if rubs else ALL)
 
-    return _summing(d, loops, walls, grows=grows)
+    return _summing(d, typed, loops, walls, grows=grows)
 
 
-def fluid_sum(d: Discretisation, ahead: bool = True, module: Any = None) -> Decorator:
+def fluid_sum(d: Discretisation, typed: TypesByName | None = None, ahead: bool = True, module: Any = None) -> Decorator:
     """Return a decorator that turns the term of a pair into its sum over the fluid alone."""
-    return _summing(d, lambda term, _: _over_fluid(term, d, ahead), module=module)
+    return _summing(d, typed, lambda term, _: _over_fluid(term, d, ahead), module=module)
 
 
-def image_sum(d: Discretisation) -> Decorator:
+def image_sum(d: Discretisation, typed: TypesByName | None = None) -> Decorator:
     """Return a decorator that turns the term of a pair into its sum over the images of the fluid in mirroring walls."""
-    return _summing(d, lambda term, _: over_images(d, term.of_neighbours, _adding_up(term)))
+    return _summing(d, typed, lambda term, _: over_images(d, term.of_neighbours, _adding_up(term)))
+
+
+def image_sum_of_solid(total: Any) -> Any:
+    """Return a sum over images restricted to the images by the walls of ``solid``, an argument before s."""
+    d, body = total.discretisation, _adding_up(total.term, f"{OWNED} * ")
+    others, loop = {**total.others, "solid": int}, over_images(d, total.arrays, body)
+    scope = {"_term": wp.func(total.term.function, module=total.module)}
+    return summed(total.key, d, total.arrays, others, total.results, loop, scope, total.module)
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
@@ -319,22 +334,22 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
     fluid and walls without slip if fluid ``sticks`` to some walls, otherwise `fluid_sum`."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
-        return pair_sum(d, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, ahead)
+        return pair_sum(d, None, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, None, ahead)
 
     return summed
 
 
-def wall_sum(d: Discretisation, grows: Any = None, weight: str = ALL) -> Decorator:
+def wall_sum(d: Discretisation, typed: TypesByName | None = None, grows: Any = None, weight: str = ALL) -> Decorator:
     """Return a decorator that turns a term into its sum over the walls alone, with the source text of a ``weight``."""
-    return _summing(d, lambda _, wall: _over_walls(wall, d, grows, weight), grows=grows)
+    return _summing(d, typed, lambda _, wall: _over_walls(wall, d, grows, weight), grows=grows)
 
 
-def solid_sum(d: Discretisation) -> Decorator:
-    return wall_sum(d, weight=f"wp.where(s.wall_solids[_b] == solid, {ALL}, _real(0.0))")
+def solid_sum(d: Discretisation, typed: TypesByName | None = None) -> Decorator:
+    return wall_sum(d, typed, weight=f"wp.where(s.wall_solids[_b] == solid, {ALL}, _real(0.0))")
 
 
-def mirror_sum(d: Discretisation, grows: Any = None) -> Decorator:
-    return wall_sum(d, grows, f"wp.where(_mirrors_in(_b, mirrors, s), {ALL}, _real(0.0))")
+def mirror_sum(d: Discretisation, typed: TypesByName | None = None, grows: Any = None) -> Decorator:
+    return wall_sum(d, typed, grows, f"wp.where(_mirrors_in(_b, mirrors, s), {ALL}, _real(0.0))")
 
 
 def _check_walls(wall: Term, term: Term) -> None:
@@ -344,8 +359,8 @@ def _check_walls(wall: Term, term: Term) -> None:
         raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
 
 
-def _adding_up(term: Term) -> Body:
-    return lambda of_j: _added("_term", term, "", term.seen_from_i(of_j))
+def _adding_up(term: Term, weight: str = "") -> Body:
+    return lambda of_j: _added("_term", term, weight, term.seen_from_i(of_j))
 
 
 def _added(called: str, term: Term, weight: str, arguments: str) -> list[str]:

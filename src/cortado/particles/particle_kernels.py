@@ -33,7 +33,7 @@ import warp as wp
 
 from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
-from cortado.device.precision import Precision, lane_functions
+from cortado.device.precision import Precision, TypesByName, lane_functions
 from cortado.particles.made_derivatives import bars_of, dot_of, warp_function, work_of
 from cortado.particles.moving_walls import turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
@@ -98,11 +98,14 @@ def particle_kernel(
     sums: Sequence[Over] = (),
     numbers: Collection[str] = (),
     name: str | None = None,
+    typed: TypesByName | None = None,
 ) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that turns a function of one particle, with annotations, into a kernel in a Warp module.
-    ``results`` are the arrays that the kernel writes, one word each; ``name`` replaces the function's name."""
+    ``results`` are the arrays that the kernel writes, one word each; ``name`` replaces the function's name, and
+    ``typed`` gives types to the parameters without any."""
 
     def make(function: Callable[..., Any]) -> Any:
+        function = typed(function) if typed else function
         term, places = Term.of(function), function.__qualname__.split(".")
         called = sub(r"\W", "", "__".join((*places[:-1], name or places[-1])))  # as Warp calls kernels
         totals = {total for one in sums for total in one.names}

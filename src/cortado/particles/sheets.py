@@ -114,8 +114,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
                 x = s.before[member, number] + s.turns_before[member, number] * own
         return x
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def hide(s, sheets, x, fluid_count, filling, count, all_count):
         i = s.first + wp.tid()
         member, x_i, listed = i // s.particles, x[i], int(all_count[i])

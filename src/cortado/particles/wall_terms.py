@@ -282,21 +282,9 @@ def solid_kernel(
 
     @typed.arrays
     def share(
-        s,
-        k: int,
-        rounds,
-        solid: int,
-        constants: pair,
-        time_step,
-        after,
-        turns,
-        turns_before,
-        scales,
-        slides,
-        power: real,
-        at,
-        bar,
-    ):
+        s, k: int, rounds, solid: int, constants: pair, time_step, after, turns, turns_before, scales, slides,
+        power: real, at, bar,
+    ):  # fmt: skip
         i = s.first + wp.tid()
         member = i // s.particles
         if s.count[i] <= s.fluid_count[i]:

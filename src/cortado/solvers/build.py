@@ -231,34 +231,37 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     """Discretise the scene of a setting into particles on a device, with all forces."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
-    lanes, moves = lanes_for(layout.particles, device, setting.lanes), bool(moving(scene.solid))
-    drains = drained_of(scene, discrete, precision)
-    shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), moves)
-    mirrors = mirrors_of(scene)
+    lanes, numbers = lanes_for(layout.particles, device, setting.lanes), wall_numbers(scene.solid)
+    drains, spacing = drained_of(scene, discrete, precision), scene.discretisation.spacing
+    shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), bool(moving(scene.solid)))
+    mirrors, placed = mirrors_of(scene), placed_sheets(scene)
     most = MOST_FACES if layout.all_particles <= most_imaged(moving=True) else 0
     faces = flat_faces(scene, discrete.lattice.support, most)
-    search = _search(scene, discrete, shared, layout, bool(np.isfinite(mirrors).any()), faces)
-    placed = placed_sheets(scene)
-    sheets = Sheets(placed, scene.discretisation.spacing, layout) if placed else None
+    search = _search(setting, shared, layout, bool(np.isfinite(mirrors).any()), faces)
+    sheets = Sheets(placed, spacing, layout) if placed else None
+    still = [_obstacle(table, table.solid(), spacing) for table in scene.solid if not table.moves]
+    moved = [_obstacle(table, table.own_solid(), spacing) for table in moving(scene.solid)]
+    # Without pressure, walls do not stop particles and are left out.
+    holds, solids = (scene.container, (still, moved)) if scene.forces.pressure else (NoContainer(), ([], []))
+    region = holds.region(scene.dimension).opened(discrete.periods)
+    free = _free_solids(setting, search, layout, still, moved)
 
     def system(discretisation: Discretisation) -> ParticleSystem:
+        made = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
         return ParticleSystem(
             setting.called,
             discretisation,
             layout,
             discrete.lattice,
             search,
-            [
-                *_forces(scene, discrete, discretisation, layout, setting.forces),
-                *([] if drains is None else [Drains(drains, layout, discretisation.taped)]),
-            ],
+            [*_forces(made, setting.forces), *([Drains(drains, layout, discretisation.taped)] if drains else [])],
             [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-            _parts(scene, discrete, discretisation, setting.free_energy, search, layout),
-            discrete.fluid.emitted.start if drains is None else 0,
-            _walled(scene, discrete),
+            _parts(setting, discretisation, search, free),
+            0 if drains else discrete.fluid.emitted.start,
+            Walled(region, discrete.near, spacing, tuple(solids[0]), tuple(solids[1]), discrete.periods),
             mirrors,
             faces,
-            _named_solids(scene),
+            {one.name: NamedSolid(numbers[one.name], padded(one.middle()[None])[0]) for one in scene.solid},
             sheets,
             of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
         )
@@ -267,47 +270,34 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
 
 
 def _search(
-    scene: Scene,
-    discrete: DiscreteScene,
-    discretisation: Discretisation,
-    layout: Layout,
-    mirrored: bool,
-    faces: FlatFaces,
+    setting: SolverSetting, discretisation: Discretisation, layout: Layout, mirrored: bool, faces: FlatFaces
 ) -> NeighbourSearch:
-    support = discrete.lattice.support
+    scene, discrete, spacing = setting.scene, setting.discrete, setting.scene.discretisation.spacing
+    near, support, walls = discrete.near, discrete.lattice.support, discrete.walls
     grid = Grid.around(
-        discrete.near.lower,
-        discrete.near.upper,
-        discrete.periods,
-        reach=(1.0 + SKIN) * support,
-        most=max(4 * layout.particles, 512),
+        near.lower, near.upper, discrete.periods, (1.0 + SKIN) * support, most=max(4 * layout.particles, 512)
     )
-    room = first_capacity(support / scene.discretisation.spacing, scene.dimension)
-    walls, (middles, turns) = discrete.walls, solid_frames(scene)
-    positions, feet = walls.positions.copy(), walls.feet.copy()
+    positions, feet, (middles, turns) = walls.positions.copy(), walls.feet.copy(), solid_frames(scene)
     for number, (middle, turn) in enumerate(zip(middles, turns, strict=True)):
         own = walls.solid == number
         positions[own], feet[own] = (positions[own] - middle) @ turn, feet[own] @ turn
     free = [number for number, table in enumerate(moving(scene.solid)) if table.motion == "free"]
     grips = walls.weights * (walls.sticks & ~np.isin(walls.solid, free))  # `FreeFriction` has that of free bodies
     positions, feet = padded(positions), padded(feet)
-    behind = faces.behind(walls.solid, positions, feet, ON * scene.discretisation.spacing)
+    behind = faces.behind(walls.solid, positions, feet, ON * spacing)
     arrays = WallArrays(positions, walls.weights, grips, feet, padded(walls.slides), walls.solid, behind)
-    imaged = mirrored or len(faces.solids) > 0
+    room, imaged = first_capacity(support / spacing, scene.dimension), mirrored or len(faces.solids) > 0
     return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension, imaged)
 
 
-def _forces(
-    scene: Scene, discrete: DiscreteScene, discretisation: Discretisation, layout: Layout, makers: Sequence[ForceMaker]
-) -> list[Force]:
+def _forces(setting: Setting, makers: Sequence[ForceMaker]) -> list[Force]:
     """Make the forces of a scene's parameters, in the order of the registry, and then the forces of the makers."""
-    setting = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
-    replaced = {getattr(maker, "replaces", None) for maker in makers}
+    replaced, scene = {getattr(maker, "replaces", None) for maker in makers}, setting.scene
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
     forces: list[Force] = []
     for maker in (*map(import_module, modules), *makers):
         if (force := maker.force(setting)) is not None:
-            _check_force(force, maker, layout.batch)
+            _check_force(force, maker, setting.layout.batch)
             forces.append(force)
     return sorted(forces, key=lambda one: bool(getattr(one, "is_last", False)))
 
@@ -335,85 +325,62 @@ def _check_force(force: Force, maker: Any, batch: int | None) -> None:
 
 
 def _parts(
-    scene: Scene,
-    discrete: DiscreteScene,
-    discretisation: Discretisation,
-    free_energy: FreeEnergy,
-    search: NeighbourSearch,
-    layout: Layout,
+    setting: SolverSetting, discretisation: Discretisation, search: NeighbourSearch, free: FreeSolids | None
 ) -> list[PartMaker]:
     """Make the parts that are not forces, in the order in which a step calls their `end`."""
-    found: list[PartMaker | None] = [_phases(scene, discretisation, free_energy), *nozzles_of(scene, discrete)]
-    found.append(_free_solids(scene, discrete, search, layout))
+    scene, count, phases = setting.scene, len(setting.scene.phase), Phases(1, None, 0.0)
+    if count > 1:
+        mobility = MOBILITIES[scene.mixture.mobility_form]
+        diffusion = Diffusion(discretisation, count, setting.free_energy, mobility)
+        phases = Phases(count, diffusion, scene.mixture.strength)
+    found: list[PartMaker] = [phases, *nozzles_of(scene, setting.discrete), *([free] if free else [])]
     if tables := moving(scene.solid):  # this also writes the walls of free bodies
         numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
         found.append(MovingSolids(numbers, scene.dimension, search))
-    return [part for part in found if part is not None]
+    return found
 
 
-def _free_solids(scene: Scene, discrete: DiscreteScene, search: NeighbourSearch, layout: Layout) -> FreeSolids | None:
+def _free_solids(
+    setting: SolverSetting, search: NeighbourSearch, layout: Layout, still: list[Obstacle], moved: list[Obstacle]
+) -> FreeSolids | None:
     """Make the part that moves free bodies with the fluid; return None without free bodies."""
-    cell = scene.discretisation.spacing**scene.dimension
-    tables = []
-    for number, table in enumerate(moving(scene.solid)):
+    scene, spacing, periods = setting.scene, setting.scene.discretisation.spacing, setting.discrete.periods
+    solids, tables = moving(scene.solid), []
+    for number, table in enumerate(solids):
         if table.motion == "free":
-            mass, hold = mass_of_one(table).in_volumes(cell), Hold.of(table, scene.dimension, scene.hinge)
+            mass = mass_of_one(table).in_volumes(spacing**scene.dimension)
+            hold = Hold.of(table, scene.dimension, scene.hinge)
             tables.append(FreeTable(table.name, number, weight_name(table), mass, hold, table.sticks))
     if not tables:
         return None
-    spacing, touching, periods = scene.discretisation.spacing, _touching(scene, discrete), discrete.periods
+    touching = _touching(setting, still, moved)
     pushes: list[Callable[[FreeSolidsPart], Push]] = [lambda part: Contacts(part, touching, spacing, periods, layout)]
-    springs, joints = ends_of(scene.spring, moving(scene.solid)), joints_of(scene.hinge, moving(scene.solid))
+    springs, joints = ends_of(scene.spring, solids), joints_of(scene.hinge, solids)
     turned, joined = ([one for one in joints if one.turns], [one for one in joints if one.against >= 0])
     if springs or turned:
         pushes.append(lambda part: Springs(part, springs, turned, layout))
     return FreeSolids(tables, scene.dimension, search, pushes, joined)
 
 
-def _touching(scene: Scene, discrete: DiscreteScene) -> list[Touching]:
+def _touching(setting: SolverSetting, still: list[Obstacle], moved: list[Obstacle]) -> list[Touching]:
     """List for each free body the solids that it may touch: all solids at rest, and each other moving solid."""
-    moved, spacing, walls = moving(scene.solid), scene.discretisation.spacing, discrete.walls
-    bodies = [number for number, table in enumerate(moved) if table.motion == "free"]
-    sides = scene.container.solids(scene.dimension, discrete.lattice.support)
-    still = [Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides]
-    still += [_obstacle(table, table.solid(), spacing) for table in scene.solid if not table.moves]
+    scene, walls, spacing = setting.scene, setting.discrete.walls, setting.scene.discretisation.spacing
+    tables = moving(scene.solid)
+    bodies = [number for number, table in enumerate(tables) if table.motion == "free"]
+    sides = scene.container.solids(scene.dimension, setting.discrete.lattice.support)
+    fixed = [*(Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides), *still]
     found = []
     for body, number in enumerate(bodies):
-        table, own = moved[number], walls.solid == number
+        table, own = tables[number], walls.solid == number
         feet = walls.positions[own] - table.middle() + walls.feet[own]
         near = feet[np.linalg.norm(walls.feet[own], axis=1) < spacing] @ table.turn(scene.dimension)
         points = np.concatenate([near, table.own_solid().faces(FINE * spacing).vertices])
-        found.append(Touching(body, -1, -1, still, points))
-        for against, one in enumerate(moved):
+        found.append(Touching(body, -1, -1, fixed, points))
+        for against, one in enumerate(tables):
             if against != number:
                 other = bodies.index(against) if against in bodies else -1
-                obstacles, slides = [_obstacle(one, one.own_solid(), spacing)], one.surface_velocity or ()
-                found.append(Touching(body, against, other, obstacles, points, slides))
+                found.append(Touching(body, against, other, [moved[against]], points, one.surface_velocity or ()))
     return found
-
-
-def _phases(scene: Scene, discretisation: Discretisation, free_energy: FreeEnergy) -> Phases:
-    mixture, count = scene.mixture, len(scene.phase)
-    if count == 1:
-        return Phases(1, None, 0.0)
-    diffusion = Diffusion(discretisation, count, free_energy, MOBILITIES[mixture.mobility_form])
-    return Phases(count, diffusion, mixture.strength)
-
-
-def _walled(scene: Scene, discrete: DiscreteScene) -> Walled:
-    """Describe the region open to particles; without pressure, walls do not stop particles and are left out."""
-    holds = scene.container if scene.forces.pressure else NoContainer()
-    region = holds.region(scene.dimension).opened(discrete.periods)
-    spacing = scene.discretisation.spacing
-    still = [_obstacle(table, table.solid(), spacing) for table in scene.solid if not table.moves]
-    moved = [_obstacle(table, table.own_solid(), spacing) for table in moving(scene.solid)]
-    solids = (tuple(still), tuple(moved)) if scene.forces.pressure else ((), ())
-    return Walled(region, discrete.near, spacing, *solids, discrete.periods)
-
-
-def _named_solids(scene: Scene) -> dict[str, NamedSolid]:
-    numbers = wall_numbers(scene.solid)
-    return {table.name: NamedSolid(numbers[table.name], padded(table.middle()[None])[0]) for table in scene.solid}
 
 
 def _obstacle(table: SolidTable, solid: Solid, spacing: float) -> Obstacle:

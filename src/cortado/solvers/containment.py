@@ -141,23 +141,11 @@ def lost_kernel(precision: Precision) -> Any:
 
     typed = TypesByName(vector, {wp.int32: "order bad count", real: "rho"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def find_lost(
-        bounds: bounds_struct,
-        solids: solids_struct,
-        particles: int,
-        first_waiting: int,
-        order,
-        x_before,
-        rho_0,
-        x_free,
-        v_free,
-        x,
-        bad_step,
-        bad,
-        count,
-    ):
+        bounds: bounds_struct, solids: solids_struct, particles: int, first_waiting: int, order, x_before, rho_0,
+        x_free, v_free, x, bad_step, bad, count,
+    ):  # fmt: skip
         """Write to ``bad`` the first lost particle of each scene, in scene order, and to ``count`` the number of lost
         particles. Scenes with an earlier bad step are skipped.
 
@@ -224,12 +212,8 @@ class Containment:
         self._obstacles = (*walled.solids, *walled.moving)
         self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in self._obstacles]
         self._poses = pose_arrays(members, 0, layout.precision, device) if moving is None else moving.named
-        self._constants: dict[str, Any] = {
-            "bounds": self._made_bounds(),
-            "solids": self._made_solids(device),
-            "particles": layout.particles,
-            "first_waiting": first_waiting,
-        }
+        self._constants: dict[str, Any] = {"particles": layout.particles, "first_waiting": first_waiting}
+        self._constants |= {"bounds": self._made_bounds(), "solids": self._made_solids(device)}
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
         """(members,) first step in which a scene lost a particle, or -1"""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
@@ -252,19 +236,9 @@ class Containment:
     ) -> None:
         """Look for lost particles, given sorted arrays before the step, sorted ``x_free`` and ``v_free`` after it
         without nozzles and drains, and the new state."""
-        self._launch(
-            self._kernel,
-            self._constants,
-            order=order,
-            x_before=x_before,
-            rho_0=rho_0,
-            x_free=x_free,
-            v_free=v_free,
-            x=state.positions,
-            bad_step=self.bad_step,
-            bad=self.bad_particle,
-            count=self._count,
-        )
+        known = {"order": order, "x_before": x_before, "rho_0": rho_0, "x_free": x_free, "v_free": v_free}
+        found = {"bad_step": self.bad_step, "bad": self.bad_particle, "count": self._count}
+        self._launch(self._kernel, self._constants, known, found, x=state.positions)
 
     def lost(self) -> dict[int, Lost]:
         """Return the particles lost since `reset`, by the number of their scene; reads from the device."""

@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 import warp as wp
@@ -59,8 +59,7 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
 
     typed = TypesByName(real, {pair: "sums", wp.int32: "iteration rounds active bad step count"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def decide(
         done: int, most: int, particles: int, tolerance: real, greatest_tolerance: real, sums, iteration, rounds, active
     ):
@@ -84,22 +83,11 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
             bad_step[b] = step[b]
         step[b] = step[b] + 1
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def record(
-        particles: int,
-        undecided: int,
-        is_last: int,
-        sums,
-        bad,
-        step,
-        iteration,
-        bad_step,
-        rounds,
-        active,
-        iterations: wp.array2d(dtype=wp.int32),
-        errors: wp.array2d(dtype=pair),
-    ):
+        particles: int, undecided: int, is_last: int, sums, bad, step, iteration, bad_step, rounds, active,
+        iterations: wp.array2d(dtype=wp.int32), errors: wp.array2d(dtype=pair),
+    ):  # fmt: skip
         """Record a loop's iterations, with those that were ``undecided``, and its errors; after the last loop count the
         step."""
         b = wp.tid()
@@ -113,13 +101,11 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
         if is_last != 0:
             end_step(b, bad, bad_step, step)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def count_step(bad, bad_step, step):
         end_step(wp.tid(), bad, bad_step, step)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def note(count, step, iterations: wp.array2d(dtype=wp.int32)):
         b = wp.tid()
         iterations[step[b], b] = count[b]
@@ -136,30 +122,6 @@ class IterativeSolve(Protocol):
     """(members,) iterations of the last solve."""
 
 
-class SolveRecord:
-    """Iterations of a force's solve in each step, on the device until they are read."""
-
-    def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
-        self.iterations = wp.zeros((max(steps, 1), layout.members), dtype=wp.int32, device=layout.device)
-        """(steps, members)"""
-        self.solve, self._kept = solve, (slice(None), 0 if layout.batch is None else slice(None))
-        self._seen, self._note = HostCopy(self.iterations), convergence_kernels(layout.precision).note
-        self.read(0)
-
-    def read(self, steps: int) -> None:
-        self.found: NDArray = self._seen.read(steps).astype(int)[self._kept]
-        """Iterations (steps,) of the steps that were read, in a batch (steps, batch)."""
-
-    def assign(self, other: "SolveRecord") -> None:
-        wp.copy(self.iterations, other.iterations)
-        self.found = other.found
-
-    def note(self, launch: KernelLauncher, step: wp.array) -> None:
-        """Record the iterations of a step's solve, given the number of the step in each scene."""
-        members = self.iterations.shape[1]
-        launch(self._note, count=self.solve.count, step=step, iterations=self.iterations, threads=members)
-
-
 @dataclass(frozen=True)
 class LoopLimits:
     minimum_iterations: int
@@ -170,34 +132,64 @@ class LoopLimits:
     """Bound on the maximum of the particles' errors; may be infinite."""
 
 
-class LoopRecord:
-    """Iterations and errors of one loop in each step, on the device until they are read."""
+class StepRecord:
+    """Arrays (steps, members) of a loop or a solve in each step, on the device until they are read."""
 
-    def __init__(self, steps: int, loop: "Loop"):
-        shape, layout = (max(steps, 1), loop.layout.members), loop.layout
-        self.iterations = wp.zeros(shape, dtype=wp.int32, device=layout.device)
-        """(steps, members)"""
-        self.errors = wp.zeros(shape, dtype=layout.precision.pair, device=layout.device)
-        """Errors of each step (steps, members), reduced by the loop's measure."""
-        self.loop = loop
-        self._seen = HostCopy(self.iterations), HostCopy(self.errors)
+    def __init__(self, steps: int, layout: Layout, *kinds: Any):
+        """Allocate arrays of these Warp types, first the iterations."""
+        shape = (max(steps, 1), layout.members)
+        self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in (wp.int32, *kinds)]
+        self._seen, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
+        self.diagnostics: dict[str, NDArray] = {}
+        """Diagnostics (steps,) by name of the steps that were read, in a batch (steps, batch)."""
+
+    def values(self, steps: int) -> list[NDArray]:
+        """Read the first ``steps`` steps of each array, (steps, ...) or in a batch (steps, batch, ...)."""
+        found = [copy.read(steps) for copy in self._seen]
+        return [array[:, 0] if self._batch is None else array for array in found]
+
+    def assign(self, other: Self) -> None:
+        for own, given in zip(self.arrays, other.arrays, strict=True):
+            wp.copy(own, given)
+        self.diagnostics = other.diagnostics
+
+
+class SolveRecord(StepRecord):
+    """Iterations of a force's solve in each step."""
+
+    def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
+        super().__init__(steps, layout)
+        self.solve, self._note = solve, convergence_kernels(layout.precision).note
         self.read(0)
 
     def read(self, steps: int) -> None:
-        loop, kept = self.loop, (slice(None), 0 if self.loop.layout.batch is None else slice(None))
-        iterations, errors = (copy.read(steps) for copy in self._seen)
-        iterations = iterations.astype(int)
-        self.counts = iterations.max(axis=1)
-        """Number of iterations of each step (steps,); in a batch, of the scene with the most."""
-        self.diagnostics: dict[str, NDArray] = {loop.iterations_name: iterations[kept]}
-        for number, name in enumerate(loop.columns):
-            self.diagnostics[name] = errors[..., number][kept].astype(np.float64)
-        """Diagnostics (steps,) by name, in a batch (steps, batch)."""
+        self.diagnostics = {self.solve.name: self.values(steps)[0].astype(int)}
 
-    def assign(self, other: "LoopRecord") -> None:
-        wp.copy(self.iterations, other.iterations)
-        wp.copy(self.errors, other.errors)
-        self.counts, self.diagnostics = other.counts, other.diagnostics
+    def note(self, launch: KernelLauncher, step: wp.array) -> None:
+        """Record the iterations of a step's solve, given the number of the step in each scene."""
+        (iterations,) = self.arrays
+        launch(self._note, count=self.solve.count, step=step, iterations=iterations, threads=iterations.shape[1])
+
+
+class LoopRecord(StepRecord):
+    """Iterations, and errors reduced by the loop's measure, of one loop in each step."""
+
+    def __init__(self, steps: int, loop: "Loop"):
+        super().__init__(steps, loop.layout, loop.layout.precision.pair)
+        self.loop = loop
+        self.read(0)
+
+    def read(self, steps: int) -> None:
+        iterations, errors = self.values(steps)
+        self.diagnostics = {self.loop.iterations_name: iterations.astype(int)}
+        for number, name in enumerate(self.loop.columns):
+            self.diagnostics[name] = errors[..., number].astype(np.float64)
+
+    @property
+    def counts(self) -> NDArray:
+        """Return the number of iterations of each step (steps,); in a batch, of the scene with the most."""
+        found = self.diagnostics[self.loop.iterations_name]
+        return found if found.ndim == 1 else found.max(axis=1)
 
     @property
     def converged(self) -> NDArray:
@@ -220,28 +212,23 @@ class IterationLog:
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
-        found: dict[str, NDArray] = {}
         scenes = () if self._layout.batch is None else (self._layout.batch,)
-        converged = np.ones((self._steps, *scenes), dtype=bool)
-        for record in self.records:
+        found, converged = dict[str, NDArray](), np.ones((self._steps, *scenes), dtype=bool)
+        for record in (*self.records, *self.solves):
             found |= record.diagnostics
-            converged &= record.converged
-        found |= {solve.solve.name: solve.found for solve in self.solves}
+        for loop in self.records:
+            converged &= loop.converged
         return {**found, "converged": converged}
 
     def read(self, steps: int) -> None:
         self._steps = steps
-        for record in self.records:
+        for record in (*self.records, *self.solves):
             record.read(steps)
-        for solve in self.solves:
-            solve.read(steps)
 
     def assign(self, other: "IterationLog") -> None:
         self._steps = other._steps
-        for own, given in zip(self.records, other.records, strict=True):
+        for own, given in zip((*self.records, *self.solves), (*other.records, *other.solves), strict=True):
             own.assign(given)
-        for solve, solved in zip(self.solves, other.solves, strict=True):
-            solve.assign(solved)
 
     def seek(self, step: int) -> Counts:
         return tuple(record.loop.seek(record, step) for record in self.records)
@@ -290,7 +277,7 @@ class Loop:
         """Prepare the loop for the iterations of a recorded step, and return their number; scenes of a batch may
         differ."""
         if self.layout.members > 1:
-            wp.copy(self.rounds, record.iterations[step])
+            wp.copy(self.rounds, record.arrays[0][step])
         return int(record.counts[step])
 
     def run(self, iterate: Callable[[int], None]) -> None:
@@ -316,34 +303,15 @@ class Loop:
     def note(self, record: LoopRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
         """Record this step's iterations and errors; the last loop of a step counts the step."""
         self._launch.join()
-        self._launch(
-            self._kernels.record,
-            particles=self.layout.particles,
-            undecided=self._fixed,
-            is_last=int(is_last),
-            sums=self._sums,
-            bad=containment.bad_particle,
-            step=step_number,
-            iteration=self._iteration,
-            bad_step=containment.bad_step,
-            rounds=self.rounds,
-            active=self._active,
-            iterations=record.iterations,
-            errors=record.errors,
-            threads=self.layout.members,
-        )
+        iterations, errors = record.arrays
+        known = {"iteration": self._iteration, "rounds": self.rounds, "active": self._active, "sums": self._sums}
+        known |= {"bad": containment.bad_particle, "bad_step": containment.bad_step, "step": step_number}
+        known |= {"iterations": iterations, "errors": errors, "particles": self.layout.particles}
+        numbers = {"undecided": self._fixed, "is_last": int(is_last)}
+        self._launch(self._kernels.record, known, **numbers, threads=self.layout.members)
 
     def _decide(self, limits: LoopLimits, done: int) -> None:
-        self._launch(
-            self._kernels.decide,
-            done=done,
-            most=limits.maximum_iterations,
-            particles=self.layout.particles,
-            tolerance=limits.tolerance,
-            greatest_tolerance=limits.greatest_tolerance,
-            sums=self._sums,
-            iteration=self._iteration,
-            rounds=self.rounds,
-            active=self._active,
-            threads=self.layout.members,
-        )
+        known = {"iteration": self._iteration, "rounds": self.rounds, "active": self._active, "sums": self._sums}
+        known |= {"most": limits.maximum_iterations, "particles": self.layout.particles, "done": done}
+        known |= {"tolerance": limits.tolerance, "greatest_tolerance": limits.greatest_tolerance}
+        self._launch(self._kernels.decide, known, threads=self.layout.members)

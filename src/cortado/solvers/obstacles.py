@@ -97,13 +97,8 @@ def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
     vertices, corners = faces.vertices - middle_of(one), faces.corners
     if vertices.shape[1] == 2:
         height = HEIGHT * (np.ptp(vertices) + spacing)
-        low, high, count = (
-            np.insert(vertices, 2, -height, axis=1),
-            np.insert(vertices, 2, height, axis=1),
-            len(vertices),
-        )
-        a, b = corners.T
-        vertices = np.concatenate([low, high])
+        (a, b), count = corners.T, len(vertices)
+        vertices = np.concatenate([np.insert(vertices, 2, end, axis=1) for end in (-height, height)])
         corners = np.concatenate([np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)])
     return wp.Mesh(
         points=wp.array(vertices, dtype=wp.vec3f, device=device),
@@ -195,12 +190,7 @@ def nozzles_of(scene: Scene, discrete: DiscreteScene) -> list[Nozzle]:
     spacing, names = scene.discretisation.spacing, [None, *(drain.name for drain in scene.drain)]
     return [
         Nozzle(
-            name=emitter.name,
-            first=first,
-            sample=sample,
-            direction=np.array(emitter.direction),
-            area=emitter.area(spacing),
-            places=discrete.fluid.places,
+            *(emitter.name, first, sample, np.array(emitter.direction), emitter.area(spacing), discrete.fluid.places),
             feeding=np.array([name in emitter.fed_by for name in names]),
         )
         for emitter, (_, first, sample) in zip(scene.emitter, discrete.fluid.emitters, strict=True)

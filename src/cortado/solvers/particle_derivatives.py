@@ -31,15 +31,9 @@ class ParticleTangent:
 
     def sort(self, context: StepContext, state_dot: State) -> None:
         solver, d = self._solver, self.dot.fields
-        context.launch(
-            solver.integration.sort,
-            x_scene=state_dot.positions,
-            v_scene=state_dot.velocities,
-            m_scene=state_dot["reference_density"],
-            x=d["x"],
-            v=d["v"],
-            m=d["m"],
-        )
+        scene = {"x_scene": state_dot.positions, "v_scene": state_dot.velocities}
+        scene["m_scene"] = state_dot["reference_density"]
+        context.launch(solver.integration.sort, scene, d.named())
         self.carried_dot.sort(context, state_dot)
         for part in self._parts:
             part.begin(context, self.dot, state_dot)

@@ -250,13 +250,9 @@ class ParticleSolver(Staying):
         for k, (loop, record) in enumerate(zip(self.loops, log.records, strict=True), 1):
             loop.note(record, containment, self.step_number, is_last=k == len(self.loops))
         if not self.loops:
-            self.launch(
-                convergence_kernels(self.discretisation.precision).count_step,
-                bad=containment.bad_particle,
-                bad_step=containment.bad_step,
-                step=self.step_number,
-                threads=self.layout.members,
-            )
+            count_step = convergence_kernels(self.discretisation.precision).count_step
+            bad = {"bad": containment.bad_particle, "bad_step": containment.bad_step}
+            self.launch(count_step, bad, step=self.step_number, threads=self.layout.members)
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
         """Return densities (n,) [kg / m3] of a state in the scene's order; in a batch the scenes are concatenated.

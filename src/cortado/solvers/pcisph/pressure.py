@@ -28,12 +28,7 @@ from cortado.sph.parts import prediction_share
 
 @cache
 def pressure_kernels(discretisation: Discretisation) -> Kernels:
-    real, vector, pair_of = (
-        discretisation.precision.real,
-        discretisation.precision.vector,
-        discretisation.precision.pair,
-    )
-    neighbourhood = neighbourhood_type(discretisation.precision)
+    (real, vector, neighbourhood), pair_of = discretisation.types, discretisation.precision.pair
     sums = density_sums(discretisation)
     weights, weights_tangent, weights_adjoint = sums.forward, sums.tangent, sums.adjoint
     values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
@@ -44,8 +39,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     names = {neighbourhood: "s", wp.int32: "rounds", vector: "x v scaled", pair_of: "error"}
     typed = TypesByName(real, {**names, values: "at", changes: "dot"})
 
-    @wp.kernel(module=discretisation.module(True, "pcisph"))
-    @typed.arrays
+    @typed.kernel(discretisation.module(True, "pcisph"))
     def pressure(s, k: int, rounds, stiffness: real, time_step, n, m, rho_0, y, x_star, p_in, p_out, c, error):
         """Write p_out = max(p_in + delta y (m n* - rho_0), 0), with n* of positions ``x_star``, and c = p_out / n^2.
         ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice, for a sum and a maximum."""
@@ -71,8 +65,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         c[i] = p_i / (n_i * n_i)
         error[i] = pair_of(compression, compression)
 
-    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(discretisation.tangent_module("pcisph"))
     def pressure_tangent(
         s, k: int, rounds, stiffness: real, time_step, time_step_dot, at, x_star, x_star_dot, dot, p_out_dot, c_dot
     ):
@@ -95,8 +88,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
         p_out_dot[i] = p_dot_i
         c_dot[i] = (p_dot_i - real(2.0) * p_i / n_i * dot.n[i]) / (n_i * n_i)
 
-    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(discretisation.module(False, "pcisph"))
     def pressure_adjoint(
         s, k: int, rounds, time_step, m, v, x_star, v_star, r, x_bar, v_bar, time_step_bar, scaled_bar
     ):
@@ -184,8 +176,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
 
     typed = TypesByName(real, {neighbourhood: "s", wp.int32: "rounds", vector: "x v acceleration scaled"})
 
-    @wp.kernel(module=discretisation.module(True, "pcisph"))
-    @typed.arrays
+    @typed.kernel(discretisation.module(True, "pcisph"))
     def pressure_force(s, k: int, rounds, time_step, m, x, v, acceleration, c, x_before, v_before, x_star, v_star):
         i = s.first + wp.tid() // LANES
         member = i // s.particles
@@ -206,8 +197,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star[i] = velocity
         x_star[i] = x_i + dt * velocity
 
-    @wp.kernel(module=discretisation.tangent_module("pcisph"), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(discretisation.tangent_module("pcisph"))
     def pressure_force_tangent(
         s, k: int, rounds, time_step, time_step_dot, at: moved, dot: moved, v_star, x_star_dot, v_star_dot
     ):
@@ -226,8 +216,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
         v_star_dot[i] = velocity_dot
         x_star_dot[i] = dot.x[i] + dt * velocity_dot + time_step_dot[member] * v_star[i]
 
-    @wp.kernel(module=discretisation.module(False, "pcisph"), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(discretisation.module(False, "pcisph"))
     def pressure_force_adjoint(
         s, k: int, rounds, stiffness: real, time_step, x, at: values, c, scaled_bar, x_bar, n_bar, bar: adjoints, r
     ):

@@ -31,7 +31,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import Named
 from cortado.device.modules import Kernels
 from cortado.device.precision import TypesByName
 from cortado.device.reduction import add
@@ -46,7 +45,7 @@ from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.pcisph.pressure import pressure_force_kernels, pressure_kernels, pressure_term
-from cortado.solvers.solver import Counts, Solver, StepAdjoint, StepTangent, WithinBar
+from cortado.solvers.solver import Counts, Solver, WithinBar
 from cortado.sph.density import density_solid_kernel, wall_slope_sums, wall_slope_term
 from cortado.sph.parts import StepContext
 
@@ -69,16 +68,14 @@ def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
         return weight(x_ij, s) * (m_i / m_j - real(1.0))
 
     @tangent_of(density_ratio_sum)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def density_ratio_sum_tangent(x_ij, x_dot_ij, m_i, m_j, m_dot_i, m_dot_j, s) -> real:
         ratio = m_i / m_j
         change = wp.dot(gradient(x_ij, s), x_dot_ij) * (ratio - real(1.0))
         return change + weight(x_ij, s) * ratio * (m_dot_i / m_i - m_dot_j / m_j)
 
     @adjoint_of(density_ratio_sum)
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def density_ratio_sum_adjoint(x_ij, m_i, m_j, t_bar_i, t_bar_j, s) -> tuple[vector, real]:
         own = t_bar_i * m_i / m_j
         other = t_bar_j * m_j / m_i
@@ -118,8 +115,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
         along = wp.dot(s.response_scale * total, s.response_scale * total_dot)
         return real(-2.0) * y_i * y_i * along
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(adjoint_module)
     def wall_relaxation_adjoint(s, x, y, y_bar, x_bar, slope_bar):
         """Add to the adjoint of positions from that of y; ``slope_bar`` gets the adjoint of S."""
         i = s.first + wp.tid() // LANES
@@ -166,7 +162,7 @@ class Iterates:
             self.c.append(self._numbers())
 
 
-class PcisphSteps(ParticleSolver):
+class Pcisph(ParticleSolver):
     topic = "pcisph"
 
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
@@ -180,12 +176,15 @@ class PcisphSteps(ParticleSolver):
             force=pressure_force_kernels(own),
             scale_adjoint=scaling_kernel(own),
         )
-        self.wall_relaxation, self.density_ratio = self.numbers(), self.numbers()
-        self.pressure_relaxation = self.numbers() if self.layout.phases > 1 else self.wall_relaxation
-        """(n,) factor of delta [-], below 1 beside walls and among lighter neighbours"""
+        wall_y, t = self.numbers(), self.numbers()
+        y = self.numbers() if self.layout.phases > 1 else wall_y
+        self.known: dict[str, Any] = {"wall_y": wall_y, "t": t, "y": y, "stiffness": self.lattice.stiffness}
+        """Arguments of kernels by name: the relaxation beside walls, t, and y (n,), the factor of delta [-], below 1
+        beside walls and among lighter neighbours."""
         self.iterates = Iterates(self.numbers, self.vectors)
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
+        self.known |= {"rounds": self.pressure_loop.rounds, "acceleration": self.accelerations[-1]}
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: IterationLog) -> None:
         context = self.predict(state, parameters)
@@ -211,51 +210,49 @@ class PcisphSteps(ParticleSolver):
     def pressures(self) -> wp.array | None:
         return None if self.limits is None else self.iterates.p[1]
 
+    def differentiable(self) -> Self:
+        return type(self)(self.system.of_one_lane(), self.limits, requires_grad=True)
+
+    def tangent(self, parameters_dot: Parameters) -> "PcisphTangent":
+        return PcisphTangent(self, parameters_dot)
+
+    def adjoint(self, steps: int) -> "PcisphAdjoint":
+        return PcisphAdjoint(self, steps)
+
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Do all of a step before the pressure iterations: sort, compute y, add up explicit forces, and predict v* = v
         + dt a, x* = x + dt v*."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
-            self._relax(context)
-        first = {"x_star": it.x_star[0], "v_star": it.v_star[0]}
-        context.launch(self.integration.predict, acceleration=self.accelerate(context), **first)
+            context.launch(self.kernels.wall_relaxation.forward, y=self.known["wall_y"])
+            if ratio := self.kernels.density_ratio:
+                context.launch(ratio.total.forward, self.known)
+                context.launch(ratio.relaxation.forward, self.known)
+        self.accelerate(context)
+        context.launch(self.integration.predict, self.known, x_star=it.x_star[0], v_star=it.v_star[0])
         context.join()
         return context
 
-    def _relax(self, context: StepContext) -> None:
-        kernels = self.kernels
-        context.launch(kernels.wall_relaxation.forward, y=self.wall_relaxation)
-        if kernels.density_ratio:
-            found = {"t": self.density_ratio, "wall_y": self.wall_relaxation, "y": self.pressure_relaxation}
-            context.launch(kernels.density_ratio.total.forward, t=found["t"])
-            context.launch(kernels.density_ratio.relaxation.forward, found)
-
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
         """Do pressure iteration k, from the previous slot to ``slot``; a run uses only slot 0."""
-        it, kernels, before = self.iterates, self.kernels, max(slot - 1, 0)
-        going = {"k": k, "rounds": self.pressure_loop.rounds}
-        context.launch(
-            kernels.pressure.forward,
-            going,
-            stiffness=self.lattice.stiffness,
-            y=self.pressure_relaxation,
-            x_star=it.x_star[before],
-            p_in=it.p[0] if k == 0 else it.p[max(slot - 1, 1)],
-            p_out=it.p[max(slot, 1)],
-            c=it.c[before],
-            error=self.pressure_loop.errors,
-        )
-        going |= {"x_before": it.x_star[before], "v_before": it.v_star[before]}
+        it, before = self.iterates, max(slot - 1, 0)
+        pressures = {"p_in": it.p[0] if k == 0 else it.p[max(slot - 1, 1)], "p_out": it.p[max(slot, 1)]}
+        pressures |= {"x_star": it.x_star[before], "c": it.c[before], "error": self.pressure_loop.errors}
+        context.launch(self.kernels.pressure.forward, self.known, pressures, k=k)
+        moved = {"x_before": it.x_star[before], "v_before": it.v_star[before], "c": it.c[before]}
         new = {"x_star": it.x_star[slot], "v_star": it.v_star[slot]}
-        context.launch(kernels.force.forward, going, acceleration=self.accelerations[-1], c=it.c[before], **new)
+        context.launch(self.kernels.force.forward, self.known, moved, new, k=k)
 
 
 class PcisphAdjoint(ParticleAdjoint):
-    def __init__(self, solver: PcisphSteps, steps: int):
+    def __init__(self, solver: Pcisph, steps: int):
         super().__init__(solver, steps)
         self._solver = solver
-        self._scaled_bar, self._slope_bar = solver.vectors(), solver.vectors()
-        self._p_bar, self._y_bar, self._r, self._t_bar = (solver.numbers() for _ in range(4))
+        precision = solver.layout.precision
+        numbers = dict.fromkeys(("p_bar", "y_bar", "r", "t_bar"), precision.real)
+        vectors = dict.fromkeys(("scaled_bar", "slope_bar"), precision.vector)
+        self._own = solver.layout.arrays(**numbers, **vectors)
+        self._own["wall_y_bar"] = self._own["y_bar"]
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         self._begin(counts, state_bar, parameters)
@@ -264,9 +261,9 @@ class PcisphAdjoint(ParticleAdjoint):
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
         state_bar.clear()
         self._begin(counts, state_bar, parameters)
-        add(within.p, self._p_bar)
+        add(within.p, self._own["p_bar"])
         if within.stress is not None:
-            add(within.stress, self._p_bar)
+            add(within.stress, self._own["p_bar"])
         self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
@@ -276,98 +273,73 @@ class PcisphAdjoint(ParticleAdjoint):
         context = solver.context(parameters)
         free_bar = self.unsort(context, state_bar)
         self.begin_step(context, free_bar, solver.iterates.v_star[iterations])
-        context.launch(solver.kernels.scale_adjoint, *self.bar.named, scaled_bar=self._scaled_bar)
-        self._y_bar.zero_()
-        self._p_bar.zero_()
+        context.launch(solver.kernels.scale_adjoint, *self.bar.named, self._own)
+        self._own["y_bar"].zero_()
+        self._own["p_bar"].zero_()
 
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
         (iterations,) = counts
-        solver, it, kernels, scaled_bar = self._solver, self._solver.iterates, self._solver.kernels, self._scaled_bar
-        context, known = solver.context(parameters), self.bar.named
-        pressure_bar = {"y_bar": self._y_bar, "p_bar": self._p_bar}
+        solver, it, kernels, topic = self._solver, self._solver.iterates, self._solver.kernels, self._solver.topic
+        context, known, own = solver.context(parameters), (self._own, *self.bar.named, solver.known), self._own
+        pushed = partial(solid_kernel, solver.discretisation, "pcisph", pressure_term, looped=True)
+        densities = partial(density_solid_kernel, solver.discretisation, topic, looped=True)
         for k in reversed(range(iterations)):
-            going = {"k": k, "rounds": solver.pressure_loop.rounds}
-            given = {"stiffness": solver.lattice.stiffness, "y": solver.pressure_relaxation, "c": it.c[k]}
-            pressures = {"p_in": it.p[k], "p_out": it.p[k + 1], **pressure_bar}
-            context.launch(kernels.force.adjoint, going, *known, given, pressures, scaled_bar=scaled_bar, r=self._r)
-            pushed = partial(solid_kernel, solver.discretisation, "pcisph", pressure_term, looped=True)
-            self.bar.solids.add(context.launch, pushed, going, *known, scaled_bar=scaled_bar, c=it.c[k])
-            predicted = {"x_star": it.x_star[k], "v_star": it.v_star[k]}
-            context.launch(kernels.pressure.adjoint, going, *known, r=self._r, scaled_bar=scaled_bar, **predicted)
-            densities = partial(density_solid_kernel, solver.discretisation, solver.topic, looped=True)
-            self.bar.solids.add(context.launch, densities, going, *known, x=it.x_star[k], bar=self._r)
+            at = {"k": k, "p_in": it.p[k], "p_out": it.p[k + 1], "c": it.c[k]}
+            at |= {"x_star": it.x_star[k], "v_star": it.v_star[k]}
+            context.launch(kernels.force.adjoint, at, *known)
+            self.bar.solids.add(context.launch, pushed, at, *known)
+            context.launch(kernels.pressure.adjoint, at, *known)
+            self.bar.solids.add(context.launch, densities, at, *known, x=it.x_star[k], bar=own["r"])
         self.predict(context, within)
-        if kernels.density_ratio:
-            ratio, own = kernels.density_ratio, {"t": solver.density_ratio, "wall_y": solver.wall_relaxation}
-            bars = {"wall_y_bar": self._y_bar, "t_bar": self._t_bar}
-            context.launch(ratio.relaxation.adjoint, own, bars)
-            context.launch(ratio.total.adjoint, *known, bars)
-        relaxed = {"y": solver.wall_relaxation, "y_bar": self._y_bar, "slope_bar": self._slope_bar}
-        context.launch(kernels.wall_relaxation.adjoint, *known, relaxed)
+        if ratio := kernels.density_ratio:
+            context.launch(ratio.relaxation.adjoint, *known)
+            context.launch(ratio.total.adjoint, *known)
+        context.launch(kernels.wall_relaxation.adjoint, *known, y=solver.known["wall_y"])
         slopes = wall_slope_term(solver.discretisation).solid_kernel
-        self.bar.solids.add(context.launch, slopes, *known, slope_bar=self._slope_bar)
+        self.bar.solids.add(context.launch, slopes, *known)
         self.mix(context, state_bar)
         self.sort(context, state_bar)
 
 
 class PcisphTangent(ParticleTangent):
-    def __init__(self, solver: PcisphSteps, parameters_dot: Parameters):
+    def __init__(self, solver: Pcisph, parameters_dot: Parameters):
         super().__init__(solver, parameters_dot)
         self._solver = solver
-        self._x_star_dot, self._v_star_dot = solver.vectors(), solver.vectors()
-        scalars = (solver.numbers() for _ in range(7))
-        self._zero_pressure, *self._p_dot, self._c_dot, self._y_dot, self._wall_y_dot, self._t_dot = scalars
+        precision = solver.layout.precision
+        vectors = dict.fromkeys(("x_star", "v_star"), precision.vector)
+        self._own = solver.layout.arrays("_dot", **vectors, **dict.fromkeys(("c", "y", "wall_y", "t"), precision.real))
+        self._own["acceleration_dot"] = self._accelerations_dot[-1]
+        self._zero_pressure, *self._p_dot = (solver.numbers() for _ in range(3))
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         (iterations,) = counts
-        solver, it, kernels, known = self._solver, self._solver.iterates, self._solver.kernels, self.dot.named
-        context = solver.context(parameters)
+        solver, it, kernels, own = self._solver, self._solver.iterates, self._solver.kernels, self._own
+        context, known = solver.context(parameters), (own, *self.dot.named, solver.known)
         self.sort(context, state_dot)
-        self._relax(known, context)
-        predicted = {"x_star_dot": self._x_star_dot, "v_star_dot": self._v_star_dot}
-        self.predict(context, it.v_star[0], **predicted)
-        accelerations = {"acceleration": solver.accelerations[-1], "acceleration_dot": self._accelerations_dot[-1]}
+        ratio, wall = kernels.density_ratio, kernels.wall_relaxation.tangent
+        wall_y_dot = own["wall_y_dot"] if ratio else own["y_dot"]
+        context.launch(wall, *known, y=solver.known["wall_y"], y_dot=wall_y_dot)
+        if ratio:
+            context.launch(ratio.total.tangent, *known)
+            context.launch(ratio.relaxation.tangent, *known)
+        self.predict(context, it.v_star[0], own["x_star_dot"], own["v_star_dot"])
         p_dot_before = self._zero_pressure
         for k in range(iterations):
-            p_dot, c_dot = self._p_dot[k % 2], self._c_dot
-            going = {"k": k, "rounds": solver.pressure_loop.rounds}
-            given = {"stiffness": solver.lattice.stiffness, "y": solver.pressure_relaxation, "y_dot": self._y_dot}
-            pressures = {"p_in": it.p[k], "p_in_dot": p_dot_before, "p_out": it.p[k + 1], "p_out_dot": p_dot}
-            there = {"x_star": it.x_star[k], "x_star_dot": self._x_star_dot}
-            context.launch(kernels.pressure.tangent, going, *known, given, pressures, there, c_dot=c_dot)
-            forces = {"c": it.c[k], "c_dot": c_dot, "v_star": it.v_star[k + 1]}
-            context.launch(kernels.force.tangent, going, *known, **accelerations, **forces, **predicted)
+            p_dot = self._p_dot[k % 2]
+            at = {"k": k, "p_in": it.p[k], "p_in_dot": p_dot_before, "p_out": it.p[k + 1], "p_out_dot": p_dot}
+            at |= {"c": it.c[k], "x_star": it.x_star[k], "v_star": it.v_star[k + 1]}
+            context.launch(kernels.pressure.tangent, at, *known)
+            context.launch(kernels.force.tangent, at, *known)
             p_dot_before = p_dot
-        self.unsort(context, self._x_star_dot, self._v_star_dot, state_dot)
+        self.unsort(context, own["x_star_dot"], own["v_star_dot"], state_dot)
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
         own = [p_dot.numpy().reshape(len(rounds), -1) for p_dot in self._p_dot]
         return np.concatenate([own[(k - 1) % 2][b] for b, k in enumerate(rounds)])
 
     stresses = pressures
-
-    def _relax(self, known: tuple[Named, ...], context: StepContext) -> None:
-        solver, kernels = self._solver, self._solver.kernels
-        y_dot = self._wall_y_dot if kernels.density_ratio else self._y_dot
-        context.launch(kernels.wall_relaxation.tangent, *known, y=solver.wall_relaxation, y_dot=y_dot)
-        if kernels.density_ratio:
-            ratio, t_dot = kernels.density_ratio, {"t_dot": self._t_dot}
-            own = {"t": solver.density_ratio, "wall_y": solver.wall_relaxation, "wall_y_dot": y_dot}
-            context.launch(ratio.total.tangent, *known, t_dot)
-            context.launch(ratio.relaxation.tangent, own, t_dot, y_dot=self._y_dot)
-
-
-class Pcisph(PcisphSteps):
-    def differentiable(self) -> Self:
-        return type(self)(self.system.of_one_lane(), self.limits, requires_grad=True)
-
-    def tangent(self, parameters_dot: Parameters) -> StepTangent:
-        return PcisphTangent(self, parameters_dot)
-
-    def adjoint(self, steps: int) -> StepAdjoint:
-        return PcisphAdjoint(self, steps)
 
 
 class PcisphMaker:

@@ -15,8 +15,8 @@ from cortado.device.cells import CellSort
 from cortado.device.grid import Grid
 from cortado.device.launching import Named
 from cortado.device.precision import FLOAT32
-from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Layout
+from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_levels import Levels
 from cortado.solvers.projection.coarse_nodes import node_kernels
@@ -32,7 +32,7 @@ from cortado.solvers.projection.lattice import SPACING
 from cortado.solvers.projection.sums import velocity_kernels
 from cortado.solvers.projection.wall_sums import FaceShares
 from cortado.sph.moment_functions import round_off, symmetric
-from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.parts import Adjoints, StepContext
 
 LEAST = 1e-5
 """The regularisation eps of a node's particles, relative to A_II on the lattice."""
@@ -44,18 +44,10 @@ MOST = 1_000
 class Coarse:
     """The coarse pressure correction of one solver: its grid, matrix and solves."""
 
-    def __init__(
-        self,
-        discretisation: Discretisation,
-        layout: Layout,
-        dimension: int,
-        grid: Grid,
-        spacing: float,
-        bodies: Bodies | None,
-        endless: bool,
-    ):
-        """Allocate for particles with a ``spacing`` [m] and free ``bodies``; an ``endless`` scene has no correction."""
-        self.endless = endless
+    def __init__(self, system: ParticleSystem, grid: Grid, bodies: Bodies | None, endless: bool):
+        """Allocate for the particles of a system and free ``bodies``; an ``endless`` scene has no correction."""
+        self.endless, dimension, spacing = endless, system.walled.dimension, system.walled.spacing
+        discretisation, layout = system.discretisation, system.layout
         precision, device = layout.precision, layout.device
         real, vector = precision.real, precision.vector
         self.push = coarse_push_kernels(discretisation, dimension)
@@ -72,7 +64,6 @@ class Coarse:
         """(corners, cells) terms of cells in the spread `source`"""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
-        self.spaced = {"spacing": spacing}
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
         self.pushed = layout.arrays(h=vector, N=precision.matrix, T=symmetric(precision).kind)
         """h, N and c L of the sorted particles."""
@@ -95,20 +86,20 @@ class Coarse:
         kept = layout.arrays(r=real, change=real, thrust=vector)
         return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
-    def begin(self, context: StepContext, around: Named) -> None:
+    def begin(self, context: StepContext, known: Named) -> None:
         """Compute the matrix of a step, and record whether all scenes are warm."""
         if self.endless:
             return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
         context.launch(self.length.every, scenes, all_warm=self._all_warm, threads=1)
         for kernel in self.push.forward:
-            context.launch(kernel, around, self.pushed)
+            context.launch(kernel, self.pushed, known)
         self._sort(context.fields["x"])
         cells = self._levels.cells
         context.launch(self.nodes.add_up, self.grid, self.pushed, cells=cells, threads=cells.shape[1])
         self._levels.begin(context)
         if self.bodies is not None:
-            self.bodies.begin(context, self.grid, around, self._levels.B)
+            self.bodies.begin(context, self.grid, known, self._levels.B)
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
         """Call ``correct`` before iteration k > 0, and before the first iteration if a scene is cold. An endless scene
@@ -127,20 +118,19 @@ class Coarse:
         context.launch(self.nodes.gather, self.grid, parts=parts, r=r, threads=len(r))
         self._levels.solve(e, self._tolerance, MOST)
 
-    def correct(self, context: StepContext, k: int, around: Named, at: Named, new: Named, T: wp.array) -> None:
+    def correct(self, context: StepContext, k: int, known: Named, at: Named, new: Named) -> None:
         """Correct the pressure before iteration k: from an iterate ``at`` write k, y and u of a ``new`` iterate with
-        `room`. ``around`` has the drift of walls; ``T`` is overwritten."""
-        context.launch(self.residual.forward, around, at, self.source, r=new["r"])
+        `room`. ``known`` has the arrays of the step with the drift of walls; its T is overwritten."""
+        context.launch(self.residual.forward, at, new, self.source, known)
         self.solve(context, self._none, new["e"])
-        own = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
-        context.launch(self.pressure.correct, own, around, at, self.grid, T=T)
-        thrown = {"y": new["change"], "T": T, "kick": new["thrust"], "u": new["u"]}
-        context.launch(self.velocity.velocity.forward, around, thrown, v_star=self.still)
+        context.launch(self.pressure.correct, at, new, self.grid, known)
+        thrown = {"y": new["change"], "kick": new["thrust"], "u": new["u"], "v_star": self.still}
+        context.launch(self.velocity.velocity.forward, thrown, known)
         carried = self.carried(context, new["change"])
-        context.launch(self.length.share.forward, own, carried, self.spaced, self.parts, self.staying(k))
+        context.launch(self.length.share.forward, new, carried, self.parts, self.staying(k), known)
         wp.copy(new["sums"], self.sums(self.parts["parts"]))
         out = {"k_out": new["k"], "y_out": new["y"], "u_out": new["u"]}
-        context.launch(self.length.apply.forward, out, own, at)
+        context.launch(self.length.apply.forward, out, at, new)
 
     def staying(self, k: int) -> dict[str, Any]:
         return {"first": int(k == 0), "stays": self.warm if k == 0 else self._none_stays}
@@ -151,104 +141,94 @@ class Coarse:
 
 
 class CoarseTangent:
-    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesTangent | None, dot: Tangents):
+    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesTangent | None, known: tuple[Named, ...]):
         precision = layout.precision
-        real, vector, six = precision.real, precision.vector, symmetric(precision).kind
-        self._coarse, self._e_dot = coarse, coarse.numbers()
+        real, vector = precision.real, precision.vector
+        self._coarse, self._e_dot, self._known = coarse, coarse.numbers(), known
         self._bodies = None
         if coarse.bodies is not None and bodies is not None:
-            self._bodies = CoarseBodiesTangent(coarse.bodies, bodies, dot)
+            self._bodies = CoarseBodiesTangent(coarse.bodies, bodies)
         self._unmoved = {**coarse.unmoved, "carried_dot": coarse.unmoved["carried"]}
-        kinds = {"h": vector, "N": precision.matrix, "r": real, "change": real, "thrust": vector}
-        self._change = layout.arrays("_dot", **kinds, T=six, u=vector)
-        self._T = layout.arrays(T=six)
+        self._pushed = {**coarse.pushed, **layout.arrays("_dot", h=vector, N=precision.matrix, T=precision.six)}
+        self._dots = layout.arrays("_dot", r=real, change=real, thrust=vector)
+        self._thrown = {"v_star": coarse.still, "v_star_dot": coarse.still, **layout.arrays("_dot", u=vector)}
 
-    def begin(self, context: StepContext, known: tuple[Named, ...]) -> None:
+    def begin(self, context: StepContext) -> None:
         for kernel in self._coarse.push.tangent:
-            context.launch(kernel, *known, self._coarse.pushed, self._change)
+            context.launch(kernel, self._pushed, *self._known)
 
-    def correct(self, context: StepContext, k: int, known: tuple[Named, ...], at: Named, new: Named) -> None:
-        own, change = self._coarse, {name: self._change[f"{name}_dot"] for name in ("change", "thrust", "r", "T", "u")}
-        found = {f"{name}_dot": change[name] for name in ("change", "thrust", "r")}
-        left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
-        context.launch(own.residual.tangent, at, *known, found)
-        every = (own.grid, left, own.pushed, self._change, *known)
-        context.launch(own.pressure.source_tangent, *every, own.source)
+    def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
+        own, dots, known = self._coarse, self._dots, self._known
+        context.launch(own.residual.tangent, drift, at, dots, *known)
+        every = new, own.grid, self._pushed, dots, *known
+        context.launch(own.pressure.source_tangent, own.source, *every)
         if self._bodies is not None:
             self._bodies.add_source(context, every, own.source)
         own.solve(context, new["e"], self._e_dot)
         context.launch(own.pressure.correct_tangent, at, *every, e_dot=self._e_dot)
-        pull = {"y": new["change"], "y_dot": change["change"], **self._T, "T_dot": change["T"]}
-        context.launch(own.velocity.pull_tangent, pull, *known)
-        thrown = {"u": new["thrust"], "v_star": own.still, "v_star_dot": own.still}
-        thrown |= {"kick_dot": change["thrust"], "u_dot": change["u"]}
-        context.launch(own.velocity.velocity.tangent, pull, thrown, *known)
+        thrown = {**self._thrown, "y": new["change"], "y_dot": dots["change_dot"], "u": new["thrust"]}
+        context.launch(own.velocity.pull_tangent, thrown, *known)
+        context.launch(own.velocity.velocity.tangent, thrown, *known, kick_dot=dots["thrust_dot"])
         carried = self._unmoved
         if self._bodies is not None:
-            carried = self._bodies.carried(context, new["change"], change["change"])
-        given, parts = {**own.spaced, **own.staying(k)}, own.parts["parts"]
-        context.launch(own.length.share.tangent, given, found, left, carried, *known, parts_dot=parts)
-        steps = {"k_out_dot": at["k_dot"], "y_out_dot": at["y_dot"], "u_out_dot": at["u_dot"]}
-        context.launch(own.length.apply.tangent, steps, at, found, left, sums_dot=own.sums(parts))
+            carried = self._bodies.carried(context, new["change"], dots["change_dot"])
+        parts = own.parts["parts"]
+        context.launch(own.length.share.tangent, own.staying(k), new, dots, carried, *known, parts_dot=parts)
+        context.launch(own.length.apply.tangent, at, new, dots, *known, sums_dot=own.sums(parts))
 
 
 class CoarseAdjoint:
-    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesAdjoint | None, bar: Adjoints, faces: FaceShares):
+    def __init__(
+        self,
+        coarse: Coarse,
+        layout: Layout,
+        bodies: BodiesAdjoint | None,
+        bar: Adjoints,
+        faces: FaceShares,
+        known: tuple[Named, ...],
+    ):
         precision = layout.precision
-        self._bar, self._faces = bar, faces
-        real, vector, six = precision.real, precision.vector, symmetric(precision).kind
+        self._bar, self._faces, self._known = bar, faces, known
+        real, vector = precision.real, precision.vector
         self._coarse, self._multiplier = coarse, coarse.numbers()
         self._bodies = None
         if coarse.bodies is not None and bodies is not None:
-            self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies, bar)
+            self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies)
         self._bars = layout.arrays("_bar", h=vector, N=precision.matrix)
         self._steps = layout.arrays("_bar", r=real, change=real, carried=real, thrust=vector, sums=precision.pair)
-        self._through = layout.arrays(T=six, f=vector, kick_bar=vector, v_bar=vector)
+        self._thrown = {"v_star": coarse.still, **layout.arrays("_bar", kick=vector, v=vector)}
         self._sum = layout.sum_of(precision.pair)
 
     def begin(self) -> None:
         for array in self._bars.values():
             array.zero_()
 
-    def correct(
-        self,
-        context: StepContext,
-        k: int,
-        known: tuple[Named, ...],
-        at: Named,
-        new: Named,
-        steps: Named,
-        u_bar: wp.array,
-    ) -> None:
-        """Apply the adjoint of the correction before iteration k: from k_bar and y_bar in ``steps`` and ``u_bar`` of
-        the ``new`` iterate to k and y of the iterate ``at``. Add to d_bar and S, which give the rest of the adjoint of
+    def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
+        """Apply the adjoint of the correction before iteration k: from the adjoints of k, y and u of the ``new``
+        iterate to those of k and y of the iterate ``at``. Write d_bar and S, which give the rest of the adjoint of
         u."""
-        own, through, found = self._coarse, self._through, self._steps
-        left = {name: new[name] for name in ("r", "e", "change", "thrust", "sums")}
-        bars = {"k_out_bar": steps["k_bar"], "y_bar": steps["y_bar"], "u_bar": u_bar}
-        context.launch(own.length.apply.adjoint, bars, left, found, at)
-        steps["k_bar"].zero_()
-        left |= own.carried(context, new["change"])
-        given = {"parts_sum_bar": self._sum(found["sums_bar"]), **own.spaced, **own.staying(k)}
-        context.launch(own.length.share.adjoint, given, left, found, *known)
+        own, found, known = self._coarse, self._steps, self._known
+        context.launch(own.length.apply.adjoint, at, new, found, *known)
+        known[0]["k_bar"].zero_()
+        given = {"parts_sum_bar": self._sum(found["sums_bar"]), **own.staying(k)}
+        context.launch(own.length.share.adjoint, given, new, own.carried(context, new["change"]), found, *known)
         if self._bodies is not None:
             self._bodies.carried(context, found["carried_bar"], new["change"], found["change_bar"])
-        thrown = {"u": new["thrust"], "v_star": own.still, "y": new["change"], "u_bar": found["thrust_bar"]}
-        context.launch(own.velocity.own_adjoint, thrown, through, *known)
-        context.launch(own.velocity.velocity.adjoint, thrown, through, *known, y_bar=found["change_bar"])
-        self._faces.add(context, self._bar, *known, u=through["f"], spread=new["change"])
-        every = (own.grid, left, own.pushed, self._bars, found, *known)
-        context.launch(own.pressure.correct_adjoint, at, {"y_bar": steps["y_bar"]}, own.source, *every)
+        thrown = {**self._thrown, "u": new["thrust"], "y": new["change"], "u_bar": found["thrust_bar"]}
+        context.launch(own.velocity.own_adjoint, thrown, *known)
+        context.launch(own.velocity.velocity.adjoint, thrown, *known, y_bar=found["change_bar"])
+        self._faces.add(context, self._bar, *known, u=known[0]["f"], spread=new["change"])
+        every = new, own.grid, own.pushed, self._bars, found, *known
+        context.launch(own.pressure.correct_adjoint, at, own.source, *every)
         own.solve(context, new["e"], self._multiplier)
         context.launch(own.pressure.source_adjoint, *every, multiplier=self._multiplier)
         if self._bodies is not None:
             self._bodies.add_source(context, every, new["e"], self._multiplier)
-        context.launch(own.residual.adjoint, steps, found, at, *known)
+        context.launch(own.residual.adjoint, drift, at, found, *known)
 
-    def finish(self, context: StepContext, known: tuple[Named, ...], share: wp.array) -> None:
-        """Turn the adjoints of the coarse push h and N into those of particles and surroundings, given the ``share``
-        c."""
+    def finish(self, context: StepContext) -> None:
+        """Turn the adjoints of the coarse push h and N into those of particles and surroundings."""
         for kernel in self._coarse.push.adjoint:
-            context.launch(kernel, *known, self._bars, self._coarse.pushed)
+            context.launch(kernel, self._bars, self._coarse.pushed, *self._known)
         given = {"u": self._bars["h_bar"], "slope": self._bars["N_bar"]}
-        self._faces.add(context, self._bar, *known, given, spread=share)
+        self._faces.add(context, self._bar, *self._known, given, spread=self._known[-1]["coarse"])

@@ -122,8 +122,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     typed = TypesByName(real, {wp.int32: "shapes", wp.int64: "starts"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def fill(members: int, shapes, starts, cells, all_nodes: int, A):
         """Write the symmetric matrices of all levels, with a thread for each node and half of its offsets."""
         offset = wp.tid() // all_nodes
@@ -138,8 +137,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
         A[entry(AROUND, offset, at.number, at)] = total
         A[entry_beside(AROUND, AROUND - 1 - offset, step, at)] = total
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def weigh(members: int, shapes, starts, A, weight):
         """Compute w of each node of all levels, 0 where the matrix is 0."""
         at = place_of(wp.tid(), members, shapes, starts)

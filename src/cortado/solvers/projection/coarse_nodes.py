@@ -162,8 +162,7 @@ def node_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     typed = TypesByName(real, {grid_type: "grid", wp.int32: "order", vector: "x h", matrix: "N"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def add_up(grid, order, eps: real, x, m, h, N, cells: wp.array2d(dtype=real)):
         cell = wp.tid()
         total, own = square(), pushes()
@@ -181,8 +180,7 @@ def node_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
             for b in range(a, CORNERS):
                 cells[pair_of(a, b), cell] = total[a, b]
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def spread(grid, order, x, of: source, e, parts: wp.array2d(dtype=real)):
         cell, total, own = wp.tid(), row(), row()
         for corner in range(CORNERS):

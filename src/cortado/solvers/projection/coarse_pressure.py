@@ -21,7 +21,7 @@ derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . 
 m.
 
 Free bodies are included on the grid so that a light body gives way from the first step on. Pressure impulses y give a
-body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i (`cortado.solvers.projection.body_kernels`). The
+body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i (`cortado.solvers.projection.bodies`). The
 body gets V = F / (rho K) and W = R' I^-1 R'^T T / rho, which reduce the divergence of particle i by (G y)_i = gamma_i .
 (V + W x r_i). G is symmetric and positive semidefinite: y . G y is twice the kinetic energy that y gives to bodies at
 rest. On the grid G adds
@@ -34,6 +34,7 @@ the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and I^-1
 
 from functools import cache
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -50,7 +51,7 @@ from cortado.solvers.projection.pressure import clamp_functions
 from cortado.solvers.projection.wall_sums import types_by_name, weights_type
 from cortado.sph.moment_functions import cross_terms_function, symmetric
 from cortado.sph.moving_solids import hold_functions
-from cortado.sph.parts import Adjoints, StepContext, Tangents
+from cortado.sph.parts import StepContext
 
 
 @cache
@@ -69,8 +70,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
 
     typed = types_by_name(precision, {grid_type: "grid", values: "e multiplier", int: "i particles"})
 
-    @particle_kernel(module, "change T", numbers=numbers)
-    @typed
+    @particle_kernel(module, "change T", numbers=numbers, typed=typed)
     def correct(i: int, grid, particles: int, x_i, L_i: matrix, coarse_i, weights_i, y_i, e) -> tuple[real, six]:
         """Return the clamped change d of the pressure y by e, and T = d L."""
         z, least = y_i + coarse_i * at(i, particles, x_i, e, grid).value, wp.min(y_i, real(0.0))
@@ -79,26 +79,11 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
             new = least + weights_i[0] * (z - least)
         return new - y_i, (new - y_i) * pack(L_i)
 
-    @particle_kernel(module, "s_value s_own s_slope s_bent", numbers=[*numbers, "eps"])
+    @particle_kernel(module, "s_value s_own s_slope s_bent", numbers=[*numbers, "eps"], typed=typed)
     def source_tangent(
-        i: int,
-        grid: grid_type,
-        particles: int,
-        eps: real,
-        x_i: vector,
-        x_dot_i: vector,
-        m_i: real,
-        m_dot_i: real,
-        coarse_i: real,
-        coarse_dot_i: real,
-        h_i: vector,
-        h_dot_i: vector,
-        N_i: matrix,
-        N_dot_i: matrix,
-        r_i: real,
-        r_dot_i: real,
-        e: values,
-    ) -> tuple[real, real, vector, vector]:
+        i, grid, particles, eps, x_i, x_dot_i, m_i, m_dot_i, coarse_i, coarse_dot_i, h_i, h_dot_i, N_i, N_dot_i, r_i,
+        r_dot_i, e,
+    ) -> tuple[real, real, vector, vector]:  # fmt: skip
         f = at(i, particles, x_i, e, grid)
         along = wp.dot(f.slope, x_dot_i)
         w = (N_i * f.slope + f.value * h_i) / m_i
@@ -110,8 +95,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
         slope = (cr - wp.dot(h_i, w)) * x_dot_i - wp.transpose(N_dot_i) * w - wp.transpose(N_i) * w_dot
         return value, own, slope, -(cross_terms(p, x_dot_i) + cross_terms(x_dot_i, p))
 
-    @particle_kernel(module, "change_dot", numbers=numbers)
-    @typed
+    @particle_kernel(module, "change_dot", numbers=numbers, typed=typed)
     def correct_tangent(
         i, grid, particles, x_i, x_dot_i, coarse_i, coarse_dot_i, weights_i, weights_dot_i, y_i, y_dot_i, e, e_dot
     ) -> real:
@@ -125,8 +109,9 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
         rise, fall = parts(below, below)
         return rise * z_dot + fall * (z_dot - below_dot + weights_dot_i[0] * below + sigma * below_dot) - y_dot_i
 
-    @particle_kernel(module, "+weights_bar +coarse_bar +x_bar +y_bar s_value s_slope s_bent s_own", numbers=numbers)
-    @typed
+    back = "+weights_bar +coarse_bar +x_bar +y_bar s_value s_slope s_bent s_own"
+
+    @particle_kernel(module, back, numbers=numbers, typed=typed)
     def correct_adjoint(
         i: int, grid, particles: int, x_i, coarse_i, weights_i, y_i, e, change_bar_i
     ) -> tuple[weights4, real, vector, real, real, vector, vector, real]:
@@ -139,19 +124,10 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
             least_bar = fall * (real(1.0) - sigma) * change_bar_i
         tension_bar, y_part = fall * below * change_bar_i, z_bar + least_bar - change_bar_i
         source = coarse_i * z_bar
-        return (
-            weights4(tension_bar, no, no, no),
-            z_bar * f.value,
-            source * f.slope,
-            y_part,
-            source,
-            vector(),
-            vector(),
-            real(0.0),
-        )
+        kept = weights4(tension_bar, no, no, no)
+        return kept, z_bar * f.value, source * f.slope, y_part, source, vector(), vector(), real(0.0)
 
-    @particle_kernel(module, "+r_bar +coarse_bar +h_bar +N_bar +m_bar +x_bar", numbers=[*numbers, "eps"])
-    @typed
+    @particle_kernel(module, "+r_bar +coarse_bar +h_bar +N_bar +m_bar +x_bar", numbers=[*numbers, "eps"], typed=typed)
     def source_adjoint(
         i: int, grid, particles: int, eps, x_i, m_i, coarse_i, h_i, N_i: matrix, r_i, e, multiplier
     ) -> tuple[real, real, vector, matrix, real, vector]:
@@ -209,16 +185,9 @@ def length_kernels(precision: Precision) -> SimpleNamespace:
         new = y_i + alpha * change_i
         return new, new, u_i + alpha * thrust_i
 
-    shares = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: share,
-        ["parts"],
-        numbers=["first", "spacing"],
-        known=["stays"],
-        written=["r", "carried"],
-        summed=["parts"],
-    )
+    roles: dict[str, Any] = {"numbers": ["first", "spacing"], "known": ["stays"]}
+    roles |= {"written": ["r", "carried"], "summed": ["parts"]}
+    shares = pointwise_kernels(precision, modules, lambda _: share, ["parts"], **roles)
     results, replaced = ["k_out", "y_out", "u_out"], {"y_out": "y", "u_out": "u"}
     written = ["sums", "change", "thrust"]
     applied = pointwise_kernels(precision, modules, lambda _: apply, results, replaced, written=written)
@@ -238,22 +207,11 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
     root, held = holds.root, holds.kind
     typed = TypesByName(real, {grid_type: "grid", vector: "x", matrix: "turns", wp.int32: "order", held: "hold"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def gather(
-        grid,
-        order,
-        first: int,
-        density,
-        volume: real,
-        inertia: matrix,
-        half: matrix,
-        hold,
-        turns,
-        x,
-        of: bundle(coarse=real, gamma_of=vector, arm=vector),
-        B: wp.array2d(dtype=real),
-    ):
+        grid, order, first: int, density, volume: real, inertia: matrix, half: matrix, hold, turns, x,
+        of: bundle(coarse=real, gamma_of=vector, arm=vector), B: wp.array2d(dtype=real),
+    ):  # fmt: skip
         """Write a body's rows of B from row ``first`` on; ``half`` is a square root of I^-1."""
         node, force, torque = wp.tid(), vector(), vector()
         member = node // (grid.shape[0] * grid.shape[1] * grid.shape[2])
@@ -284,19 +242,16 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
 
     typed = types_by_name(precision, {grid_type: "grid", values: "e multiplier", int: "i particles", real: "lifted"})
 
-    @particle_kernel(module, "lifted_dot", numbers=numbers)
-    @typed
+    @particle_kernel(module, "lifted_dot", numbers=numbers, typed=typed)
     def lift_tangent(i: int, grid, particles: int, x_i, x_dot_i, coarse_i, coarse_dot_i, e) -> real:
         f = at(i, particles, x_i, e, grid)
         return coarse_dot_i * f.value + coarse_i * wp.dot(f.slope, x_dot_i)
 
-    @particle_kernel(module, "+s_value +s_slope")
-    @typed
+    @particle_kernel(module, "+s_value +s_slope", typed=typed)
     def source_tangent(x_dot_i, coarse_i, coarse_dot_i, carried_i, carried_dot_i) -> tuple[real, vector]:
         return -coarse_dot_i * carried_i - coarse_i * carried_dot_i, -(coarse_i * carried_i) * x_dot_i
 
-    @particle_kernel(module, "+coarse_bar +x_bar", numbers=numbers)
-    @typed
+    @particle_kernel(module, "+coarse_bar +x_bar", numbers=numbers, typed=typed)
     def source_adjoint(
         i: int, grid, particles: int, x_i, coarse_i, e, multiplier, carried_i, lifted_bar_i
     ) -> tuple[real, vector]:
@@ -319,10 +274,10 @@ class CoarseBodies:
         self.rows = self._each * len(bodies.held)
         self._none = layout.arrays(none=precision.real)["none"]
 
-    def begin(self, context: StepContext, grid: Named, around: Named, B: wp.array) -> None:
+    def begin(self, context: StepContext, grid: Named, known: Named, B: wp.array) -> None:
         for number, (held, root) in enumerate(zip(self.bodies.held, self._roots, strict=True)):
-            own, known = {"first": self._each * number, "half": root}, self.bodies.known(context, held)
-            context.launch(self.kernels.gather, grid, own, around, *known, B=B, threads=B.shape[1])
+            own, bodies = {"first": self._each * number, "half": root}, self.bodies.known(context, held)
+            context.launch(self.kernels.gather, grid, own, *bodies, known, B=B, threads=B.shape[1])
 
     def carried(self, context: StepContext, y: wp.array) -> wp.array:
         """Return G y, the divergence that pressures y remove by moving bodies; the next call overwrites it."""
@@ -337,14 +292,14 @@ def _root(inertia: np.ndarray) -> np.ndarray:
 
 
 class CoarseBodiesTangent:
-    def __init__(self, own: CoarseBodies, bodies: BodiesTangent, dot: Tangents):
-        self._own, self._bodies, self._dot = own, bodies.at_rest(own.bodies), dot
+    def __init__(self, own: CoarseBodies, bodies: BodiesTangent):
+        self._own, self._bodies = own, bodies.at_rest(own.bodies)
         self._none = wp.zeros_like(own.bodies.drift)
         self._lifted = {"lifted": wp.zeros_like(self._none), "lifted_dot": wp.zeros_like(self._none)}
 
     def carried(self, context: StepContext, y: wp.array, y_dot: wp.array) -> dict[str, wp.array]:
         carried = self._own.carried(context, y)
-        change = self._bodies.drifted(context, self._dot, self._none, y, y_dot)
+        change = self._bodies.drifted(context, self._none, y, y_dot)
         return {"carried": carried, "carried_dot": change}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], source: Named) -> None:
@@ -357,13 +312,13 @@ class CoarseBodiesTangent:
 
 
 class CoarseBodiesAdjoint:
-    def __init__(self, own: CoarseBodies, bodies: BodiesAdjoint, bar: Adjoints):
-        self._own, self._bodies, self._bar = own, bodies.at_rest(own.bodies), bar
+    def __init__(self, own: CoarseBodies, bodies: BodiesAdjoint):
+        self._own, self._bodies = own, bodies.at_rest(own.bodies)
         names = ("lifted", "lifted_bar", "carried_bar")
         self._lifted = {name: wp.zeros_like(own.bodies.drift) for name in names}
 
     def carried(self, context: StepContext, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        self._bodies.carried(context, self._bar, carried_bar, y, y_bar)
+        self._bodies.carried(context, carried_bar, y, y_bar)
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
         """Add the adjoints of -lambda . c G c E, with the ``multiplier`` lambda, to those of all inputs."""

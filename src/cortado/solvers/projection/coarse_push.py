@@ -44,15 +44,13 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
         return f, -f[0] * x_ij, -f[1] * x_ij, -f[2] * x_ij
 
     @tangent_of(push)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def push_tangent(x_ij, x_dot_ij, T_j, T_dot_j, s) -> tuple[vector, vector, vector, vector]:
         g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
         f, c = times(T_j, g), times(T_dot_j, g) + times(T_j, g_dot)
         return c, -c[0] * x_ij - f[0] * x_dot_ij, -c[1] * x_ij - f[1] * x_dot_ij, -c[2] * x_ij - f[2] * x_dot_ij
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def push_back(x_ij, T_i, T_j, h_bar_i, h_bar_j, N_bar_i, N_bar_j, s) -> tuple[vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         from_i, from_j = h_bar_i - N_bar_i * x_ij, h_bar_j + N_bar_j * x_ij
@@ -71,30 +69,17 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
     (real, vector, _), pair = discretisation.types, pair_functions(discretisation)
     gradient, hessian_product, typed = pair.gradient, pair.hessian_product, types_by_name(discretisation.precision)
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def push(x_ij, direct, coarse_i, coarse_j, image_i, image_j, s) -> tuple[vector, vector, vector, vector]:
         g = s.volume * gradient(x_ij, s)
         f = (image_j * coarse_j) * g
         return f + (image_i * coarse_i) * g, -f[0] * direct, -f[1] * direct, -f[2] * direct
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def push_tangent(
-        x_ij,
-        x_dot_ij,
-        direct,
-        direct_dot,
-        coarse_i,
-        coarse_j,
-        coarse_dot_i,
-        coarse_dot_j,
-        image_i,
-        image_j,
-        image_dot_i,
-        image_dot_j,
-        s,
-    ) -> tuple[vector, vector, vector, vector]:
+        x_ij, x_dot_ij, direct, direct_dot, coarse_i, coarse_j, coarse_dot_i, coarse_dot_j, image_i, image_j,
+        image_dot_i, image_dot_j, s,
+    ) -> tuple[vector, vector, vector, vector]:  # fmt: skip
         g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
         q, p, p_dot = image_i * coarse_i, image_j * coarse_j, image_dot_j * coarse_j + image_j * coarse_dot_j
         f, c = p * g, p_dot * g + p * g_dot
@@ -102,8 +87,7 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
         row_x, row_y = -c[0] * direct - f[0] * direct_dot, -c[1] * direct - f[1] * direct_dot
         return total, row_x, row_y, -c[2] * direct - f[2] * direct_dot
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def push_back(
         x_ij, direct, coarse_i, coarse_j, image_i, image_j, h_bar_i, h_bar_j, N_bar_i, N_bar_j, s
     ) -> tuple[real, vector]:
@@ -139,8 +123,7 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def both(sums_of: Any, images_of: Any) -> list[Any]:
         return [over(sums_of, names[0]), over(images_of, names[1])]
 
-    @particle_kernel(module, "h N", both(sums.forward, mirrors.forward))
-    @typed
+    @particle_kernel(module, "h N", both(sums.forward, mirrors.forward), typed=typed)
     def coarse_push(
         total, row_x, row_y, row_z, lifted, lift_x, lift_y, lift_z, T_i, g_i, coarse_i, gamma_i
     ) -> tuple[vector, matrix]:
@@ -151,34 +134,18 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def pull_tangent(coarse_i: real, coarse_dot_i: real, L_i: matrix, L_dot_i: matrix) -> tuple[six, six]:
         return coarse_i * pack(L_i), coarse_dot_i * pack(L_i) + coarse_i * pack(L_dot_i)
 
-    @particle_kernel(tangent_module, "h_dot N_dot", both(sums.tangent, mirrors.tangent))
-    @typed
+    @particle_kernel(tangent_module, "h_dot N_dot", both(sums.tangent, mirrors.tangent), typed=typed)
     def coarse_push_tangent(
-        total,
-        row_x,
-        row_y,
-        row_z,
-        lifted,
-        lift_x,
-        lift_y,
-        lift_z,
-        T_i,
-        T_dot_i,
-        g_i,
-        g_dot_i,
-        coarse_i,
-        coarse_dot_i,
-        gamma_i,
-        gamma_dot_i,
-    ) -> tuple[vector, matrix]:
+        total, row_x, row_y, row_z, lifted, lift_x, lift_y, lift_z, T_i, T_dot_i, g_i, g_dot_i, coarse_i, coarse_dot_i,
+        gamma_i, gamma_dot_i,
+    ) -> tuple[vector, matrix]:  # fmt: skip
         own_part = times(T_dot_i, g_i) + times(T_i, g_dot_i)
         own_part += coarse_dot_i * gamma_i + coarse_i * gamma_dot_i
         return total + lifted + own_part, wp.matrix_from_rows(row_x + lift_x, row_y + lift_y, row_z + lift_z)
 
     back = [over(sums.adjoint, "diagonal others x_part"), over(mirrors.adjoint, "widened x_lift")]
 
-    @particle_kernel(adjoint_module, "+x_bar +L_bar +coarse_bar +image_bar +g_bar +gamma_bar", back)
-    @typed
+    @particle_kernel(adjoint_module, "+x_bar +L_bar +coarse_bar +image_bar +g_bar +gamma_bar", back, typed=typed)
     def coarse_push_adjoint(
         diagonal, others, x_part, widened, x_lift, L_i, T_i, g_i, coarse_i, image_i, gamma_i, h_bar_i
     ) -> tuple[vector, matrix, real, real, vector, vector]:
@@ -219,8 +186,7 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 
     both = [over(gradient, "row_x row_y row_z", v="u"), over(spread, "widened")]
 
-    @particle_kernel(module, "A d r s_value s_slope s_bent s_own", both)
-    @typed
+    @particle_kernel(module, "A d r s_value s_slope s_bent s_own", both, typed=typed)
     def residual(
         row_x, row_y, row_z, widened, time_step, n_i, L_i, gamma_i, drift_i, weights_i, image_i, coarse_i, u_i, y_i
     ) -> tuple[matrix, real, real, real, vector, vector, real]:
@@ -238,32 +204,11 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
         over(spread_tangent, "widened_dot"),
     ]
 
-    @particle_kernel(tangent_module, "r_dot", both)
+    @particle_kernel(tangent_module, "r_dot", both, typed=typed)
     def residual_tangent(
-        row_x: vector,
-        row_y: vector,
-        row_z: vector,
-        widened: real,
-        widened_dot: real,
-        time_step: real,
-        time_step_dot: real,
-        n_i: real,
-        n_dot_i: real,
-        L_i: matrix,
-        L_dot_i: matrix,
-        gamma_i: vector,
-        gamma_dot_i: vector,
-        drift_dot_i: real,
-        weights_i: weights4,
-        weights_dot_i: weights4,
-        image_i: real,
-        image_dot_i: real,
-        u_i: vector,
-        u_dot_i: vector,
-        A_i: matrix,
-        d_i: real,
-        y_i: real,
-    ) -> real:
+        row_x, row_y, row_z, widened, widened_dot, time_step, time_step_dot, n_i, n_dot_i, L_i, L_dot_i, gamma_i,
+        gamma_dot_i, drift_dot_i, weights_i, weights_dot_i, image_i, image_dot_i, u_i, u_dot_i, A_i, d_i, y_i,
+    ) -> real:  # fmt: skip
         D_dot = wp.ddot(L_i, wp.matrix_from_rows(row_x, row_y, row_z)) + wp.ddot(L_dot_i, A_i) - drift_dot_i
         D_dot += wp.dot(gamma_i, u_dot_i) + wp.dot(gamma_dot_i, u_i)
         D_dot += image_i * widened_dot + image_dot_i * widened

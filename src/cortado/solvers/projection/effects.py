@@ -200,8 +200,7 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
     def lift(x_ij: vector, y_i: real, y_j: real, image_i: real, image_j: real, s: neighbourhood) -> vector:
         return ((image_i * y_i + image_j * y_j) * s.volume) * gradient(x_ij, s)
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def lift_tangent(
         x_ij, x_dot_ij, y_i, y_j, y_dot_i, y_dot_j, image_i, image_j, image_dot_i, image_dot_j, s
     ) -> vector:
@@ -209,8 +208,7 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
         bent = (image_i * y_i + image_j * y_j) * hessian_product(x_ij, x_dot_ij, s)
         return s.volume * (c_dot * gradient(x_ij, s) + bent)
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def lift_back(x_ij, y_i, y_j, image_i, image_j, f_ij, s) -> tuple[real, vector]:
         c = (image_i * y_i + image_j * y_j) * s.volume
         return s.volume * wp.dot(gradient(x_ij, s), f_ij), c * hessian_product(x_ij, f_ij, s)
@@ -237,14 +235,12 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
         bent = wp.dot(hessian_product(x_ij, x_dot_ij, s), swept)
         return s.volume * (wp.dot(gradient(x_ij, s), swept_dot) + bent)
 
-    @mirror_sum(discretisation)
-    @typed
+    @mirror_sum(discretisation, typed)
     def mirror_walls(x_ij, v_j, foot, mirrors: int, s) -> tuple[vector, real, real]:
         part = s.volume * normal(gradient(x_ij, s), foot)
         return part, s.volume * weight(x_ij, s), wp.dot(part, v_j)
 
-    @mirror_sum(discretisation, grows=mirror_walls)
-    @typed
+    @mirror_sum(discretisation, typed, grows=mirror_walls)
     def mirror_walls_tangent(
         x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, mirrors: int, s
     ) -> tuple[vector, real, real]:
@@ -253,8 +249,7 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
         part_dot = normal(s.volume * hessian_product(x_ij, rest, s), foot) + wp.cross(turn_dot, part)
         return part_dot, wp.dot(g, rest), wp.dot(part_dot, v_j) + wp.dot(part, v_dot_j)
 
-    @mirror_sum(discretisation)
-    @typed
+    @mirror_sum(discretisation, typed)
     def mirror_walls_back(x_ij, v_j, mirror_bar_i, behind_bar_i, sweep_bar_i, foot, mirrors: int, s) -> vector:
         """Return the adjoint of x; the adjoint of the drift is -``sweep_bar``."""
         bent = hessian_product(x_ij, normal(mirror_bar_i - sweep_bar_i * v_j, foot), s)

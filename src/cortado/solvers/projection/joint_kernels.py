@@ -63,19 +63,9 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
 
     @typed
     def point(
-        time_step_i,
-        place_i,
-        turns_before_i,
-        after_i,
-        turns_i,
-        other_turns_before_i,
-        other_after_i,
-        other_turns_i,
-        middle,
-        begun,
-        other_middle,
-        other_begun,
-    ) -> row:
+        time_step_i, place_i, turns_before_i, after_i, turns_i, other_turns_before_i, other_after_i, other_turns_i,
+        middle, begun, other_middle, other_begun,
+    ) -> row:  # fmt: skip
         own, other = wp.transpose(begun) * (place_i - middle), wp.transpose(other_begun) * (place_i - other_middle)
         reach, other_reach = turns_i * own, other_turns_i * other
         apart = (after_i + reach - other_after_i - other_reach) / time_step_i
@@ -89,14 +79,7 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
 
     @typed
     def lean(
-        time_step_i,
-        turns_before_i,
-        turns_i,
-        other_turns_before_i,
-        other_turns_i,
-        axis,
-        begun,
-        other_begun,
+        time_step_i, turns_before_i, turns_i, other_turns_before_i, other_turns_i, axis, begun, other_begun
     ) -> row:
         own, other = wp.transpose(begun) * axis, wp.transpose(other_begun) * axis
         n = turns_before_i * own
@@ -135,16 +118,9 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
 
     @typed
     def read(
-        apart_i,
-        take_i,
-        other_take_i,
-        faster_i,
-        turned_faster_i,
-        other_faster_i: vector,
-        other_turned_faster_i: vector,
-        share,
-        is_free,
-    ) -> vector:
+        apart_i, take_i, other_take_i, faster_i, turned_faster_i, other_faster_i: vector,
+        other_turned_faster_i: vector, share, is_free,
+    ) -> vector:  # fmt: skip
         against = wp.where(is_free, one, no) * (share * other_faster_i + other_take_i * other_turned_faster_i)
         return apart_i + share * faster_i + take_i * turned_faster_i - against
 

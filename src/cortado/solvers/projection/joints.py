@@ -22,6 +22,16 @@ move. Along the axis of a hinge, where K of the angles is 0, the whole trace is 
 BARS = ("turned_before_bar", "after_bar", "turned_bar")
 
 
+@dataclass(frozen=True)
+class Pair:
+    """A row and a column of K that a body couples."""
+
+    block: tuple[int, int]
+    body: int
+    far: tuple[bool, bool]
+    """For row and column, True if the body is the hinge's second solid."""
+
+
 class JointArrays:
     """Arrays of the hinges in a step, or tangents or adjoints with names that end in ``suffix``."""
 
@@ -45,6 +55,12 @@ class JointArrays:
         way = "other_" if other else ""
         return {f"{name}{self._suffix}": self.rows[k][f"{way}{name}{self._suffix}"] for name in ("give", "take")}
 
+    def sides(self, pair: Pair) -> Arrays:
+        """Return ``take`` of the row and ``give`` of the column of a pair."""
+        give, take = f"give{self._suffix}", f"take{self._suffix}"
+        row, column = (self.side(k, far) for k, far in zip(pair.block, pair.far, strict=True))
+        return {take: row[take], give: column[give]}
+
     def clear(self) -> None:
         for group in (*self.rows, self.whole):
             for array in group.values():
@@ -60,6 +76,10 @@ class Row:
     """True for the row that keeps the axis, False for the row that keeps the point."""
 
     @property
+    def place(self) -> str:
+        return f"{self.joint.name}.position"
+
+    @property
     def share(self) -> float:
         """Return 1 if lambda is a momentum, 0 if lambda is an angular momentum."""
         return 0.0 if self.straight else 1.0
@@ -68,16 +88,6 @@ class Row:
     def sides(self) -> list[tuple[int, bool]]:
         """Return the numbers of the row's free bodies, each with True for the hinge's second solid."""
         return [(body, other) for body, other in ((self.joint.body, False), (self.joint.other, True)) if body >= 0]
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A row and a column of K that a body couples."""
-
-    block: tuple[int, int]
-    body: int
-    far: tuple[bool, bool]
-    """For row and column, True if the body is the hinge's second solid."""
 
 
 class Joints:
@@ -110,45 +120,58 @@ class Joints:
         """Make the kernels on first use, because scenes without hinges need none."""
         return joint_kernels(self.layout.precision)
 
-    def poses(self, row: Row) -> tuple[Named, ...]:
-        """Return the poses of both solids of a row, with tangents, and the poses at the start of the run."""
-        joint, each = row.joint, self.part.made_of.walls.each
-        named = {**each[self.number(row)], **{f"other_{name}": array for name, array in each[joint.against].items()}}
-        known: dict[str, Any] = {} if joint.axis is None else {"axis": self.layout.precision.vector(*joint.axis)}
-        for way, begun in zip(("", "other_"), joint.begun, strict=True):
-            known[f"{way}middle"] = self.layout.precision.vector(*begun.middle)
-            known[f"{way}begun"] = self.layout.precision.matrix(*begun.turn.ravel())
-        return named, known
-
     def number(self, row: Row) -> int:
         return self.part.bodies[row.joint.body].table.number
 
-    def frame(self, row: Row) -> Any:
-        return self.kernels.lean if row.straight else self.kernels.point
+    def weight(self, body: int) -> str:
+        return self.part.bodies[body].table.weight
 
-    def coefficients(self, pair: Pair) -> Named:
-        """Return the arguments of `weigh` for one of `pairs`."""
-        row, column = (self.rows[k] for k in pair.block)
-        own = {"row_share": row.share, "share": column.share, "sign": 1.0 if pair.far[0] == pair.far[1] else -1.0}
-        guard = GUARD[self.layout.precision.name] if row is column else 0.0
-        return {**own, "guard": guard, "along": float(row is column and row.straight)}
+    def frames(self, step: StepContext) -> Iterator[tuple[int, Row, Any, tuple[Named, ...]]]:
+        """Yield each row with its number, the kernels of its matrices, and their arguments: the place, and the poses of
+        both solids, with tangents, and at the start of the run."""
+        vector, each = self.layout.precision.vector, self.part.made_of.walls.each
+        for k, row in enumerate(self.rows):
+            joint = row.joint
+            named = {**each[self.number(row)], **{f"other_{name}": a for name, a in each[joint.against].items()}}
+            known: dict[str, Any] = {} if joint.axis is None else {"axis": vector(*joint.axis)}
+            for way, begun in zip(("", "other_"), joint.begun, strict=True):
+                known[f"{way}middle"] = vector(*begun.middle)
+                known[f"{way}begun"] = self.layout.precision.matrix(*begun.turn.ravel())
+            known["place"] = step.parameters[row.place]
+            yield k, row, self.kernels.lean if row.straight else self.kernels.point, (self.own.rows[k], known, named)
 
-    def sides(self, arrays: JointArrays, pair: Pair) -> Arrays:
-        """Return ``take`` of the row and ``give`` of the column of one of `pairs`."""
-        take, give = (arrays.side(k, far) for k, far in zip(pair.block, pair.far, strict=True))
-        return {name: (take if name.startswith("take") else give)[name] for name in take}
+    def weighed(self, step: StepContext) -> Iterator[tuple[Pair, tuple[Named, ...]]]:
+        """Yield `pairs` with the arguments of `weigh`."""
+        for pair in self.pairs:
+            row, column = (self.rows[k] for k in pair.block)
+            own = {"row_share": row.share, "share": column.share, "sign": 1.0 if pair.far[0] == pair.far[1] else -1.0}
+            own |= {"guard": GUARD[self.layout.precision.name] if row is column else 0.0}
+            own |= {"along": float(row is column and row.straight)}
+            body = self.part.bodies[pair.body].known(step)
+            yield pair, (self.own.sides(pair), own, self.own.blocks[pair.block], *body)
+
+    def read(self, moved: Sequence[Arrays]) -> Iterator[tuple[int, Row, tuple[Named, ...]]]:
+        """Yield the rows with the arguments of the kernel `read`, given velocities ``moved`` by `move_kernels`."""
+        for k, row in enumerate(self.rows):
+            numbers = {"share": row.share, "is_free": row.joint.other >= 0}
+            yield k, row, (velocities(row, moved), self.own.rows[k], self.own.entries[k], numbers)
+
+    def ends(self, step: StepContext, moved: Sequence[Arrays]) -> Iterator[tuple[int, int, bool, tuple[Named, ...]]]:
+        """Yield row number, body number, whether the body is the hinge's second solid, and arguments of `push`."""
+        for k, row in enumerate(self.rows):
+            for body, other in row.sides:
+                signs, own = {"share": row.share, "sign": -1.0 if other else 1.0}, self.part.bodies[body].known(step)
+                yield k, body, other, (self.own.side(k, other), self.own.entries[k], moved[body], signs, *own)
 
     def begin(self, step: StepContext) -> None:
-        members = self.layout.members
         self.own.whole["blocks"].zero_()
-        for row, arrays in zip(self.rows, self.own.rows, strict=True):
-            place = {"place": step.parameters[f"{row.joint.name}.position"]}
-            step.launch(self.frame(row).forward, arrays, place, *self.poses(row), threads=members)
-        for pair in self.pairs:
-            known = self.sides(self.own, pair), self.coefficients(pair), self.own.blocks[pair.block]
-            step.launch(self.kernels.weigh.forward, *known, *self.part.bodies[pair.body].known(step), threads=members)
+        for _, _, kernels, known in self.frames(step):
+            step.launch(kernels.forward, *known, threads=self.layout.members)
+        for _, known in self.weighed(step):
+            step.launch(self.kernels.weigh.forward, *known, threads=self.layout.members)
         if self.rows:
-            step.launch(self.kernels.factor, self.own.whole, self.factors, rows=len(self.rows), threads=members)
+            factors = self.own.whole, self.factors
+            step.launch(self.kernels.factor, *factors, rows=len(self.rows), threads=self.layout.members)
 
     def solve(self, step: StepContext, wanted: wp.array, pushes: wp.array, transposed: int = 0) -> None:
         """Write -K^-1 times ``wanted``; with ``transposed``, use the transpose of K."""
@@ -156,129 +179,101 @@ class Joints:
         if self.rows:
             step.launch(self.kernels.solve, self.factors, known, threads=self.layout.members)
 
-    def read(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Write lambda, given the velocities ``moved`` of bodies without hinges by `move_kernels`."""
-        for k, row in enumerate(self.rows):
-            step.launch(self.kernels.read.forward, *self.known(k, row, moved), threads=self.layout.members)
+    def find(self, step: StepContext, moved: Sequence[Arrays]) -> None:
+        """Write lambda, given the velocities ``moved`` of bodies without hinges."""
+        for _, _, known in self.read(moved):
+            step.launch(self.kernels.read.forward, *known, threads=self.layout.members)
         self.solve(step, self.own.whole["wanted"], self.own.whole["pushes"])
 
-    def known(self, k: int, row: Row, moved: Sequence[Arrays]) -> tuple[Named, ...]:
-        """Return the arguments of `read`."""
-        numbers = {"share": row.share, "is_free": row.joint.other >= 0}
-        return self.velocities(row, moved), self.own.rows[k], self.own.entries[k], numbers
-
-    def velocities(self, row: Row, moved: Sequence[Arrays], suffix: str = "") -> Arrays:
-        """Return the velocity changes of both bodies of a row, or tangents or adjoints, by argument names of `read`."""
-        own = moved[row.joint.body]
-        other = own if row.joint.other < 0 else moved[row.joint.other]
-        names = [f"{name}{suffix}" for name in ("faster", "turned_faster")]
-        return {name: own[name] for name in names} | {f"other_{name}": other[name] for name in names}
-
-    def ends(self) -> Iterator[tuple[int, int, bool, Named]]:
-        """Yield row number, body number, whether the body is the hinge's second solid, and arguments of `push`."""
-        for k, row in enumerate(self.rows):
-            for body, other in row.sides:
-                yield k, body, other, {"share": row.share, "sign": -1.0 if other else 1.0}
-
     def push(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        for k, body, other, known in self.ends():
-            arrays = self.own.side(k, other), self.own.entries[k], moved[body]
-            own = self.part.bodies[body].known(step)
-            step.launch(self.kernels.push.forward, *arrays, known, *own, threads=self.layout.members)
+        for *_, known in self.ends(step, moved):
+            step.launch(self.kernels.push.forward, *known, threads=self.layout.members)
 
     def join(self, step: StepContext, moved: Sequence[Arrays]) -> None:
         """Replace velocities of bodies without hinges by velocities that satisfy the hinges."""
-        self.read(step, moved)
+        self.find(step, moved)
         self.push(step, moved)
 
 
-class JointsTangent:
-    def __init__(self, joints: Joints):
-        self._joints, self._dots = joints, JointArrays(len(joints.rows), joints.layout, "_dot")
+def velocities(row: Row, moved: Sequence[Arrays], suffix: str = "") -> Arrays:
+    """Return the velocity changes of both bodies of a row, or tangents or adjoints, by argument names of `read`."""
+    own = moved[row.joint.body]
+    other = own if row.joint.other < 0 else moved[row.joint.other]
+    names = [f"{name}{suffix}" for name in ("faster", "turned_faster")]
+    return {name: own[name] for name in names} | {f"other_{name}": other[name] for name in names}
 
-    def begin(self, step: StepContext, dot: Tangents) -> None:
+
+class JointsTangent:
+    def __init__(self, joints: Joints, dot: Tangents):
+        self._joints, self._dot = joints, dot.parameters
+        self._dots = JointArrays(len(joints.rows), joints.layout, "_dot")
+
+    def begin(self, step: StepContext) -> None:
         of, dots, members = self._joints, self._dots, self._joints.layout.members
         dots.whole["blocks_dot"].zero_()
-        for k, row in enumerate(of.rows):
-            place = f"{row.joint.name}.position"
-            rates = {"place_dot": dot.parameters[place], "time_step_dot": dot.parameters["time_step"]}
-            known = of.own.rows[k], {"place": step.parameters[place]}, *of.poses(row)
-            step.launch(of.frame(row).tangent, dots.rows[k], rates, *known, threads=members)
-        for pair in of.pairs:
-            body = of.part.bodies[pair.body]
-            rates = {"density_dot": dot.parameters[body.table.weight]}
-            known = of.sides(of.own, pair), of.coefficients(pair), of.own.blocks[pair.block], *body.known(step)
-            changes = of.sides(dots, pair), dots.blocks[pair.block], rates
+        for k, row, kernels, known in of.frames(step):
+            rates = {"place_dot": self._dot[row.place], "time_step_dot": self._dot["time_step"]}
+            step.launch(kernels.tangent, dots.rows[k], rates, *known, threads=members)
+        for pair, known in of.weighed(step):
+            changes = dots.sides(pair), dots.blocks[pair.block], {"density_dot": self._dot[of.weight(pair.body)]}
             step.launch(of.kernels.weigh.tangent, *changes, *known, threads=members)
 
-    def join(self, step: StepContext, dot: Tangents, moved: Sequence[Arrays], moved_dot: Sequence[Arrays]) -> None:
+    def join(self, step: StepContext, moved: Sequence[Arrays], moved_dot: Sequence[Arrays]) -> None:
         """Apply the tangent of `Joints.join`, which joins ``moved`` too."""
         of, dots, members = self._joints, self._dots, self._joints.layout.members
-        of.read(step, moved)
-        for k, row in enumerate(of.rows):
-            changes = of.velocities(row, moved_dot, "_dot"), dots.rows[k], dots.entries[k]
-            step.launch(of.kernels.read.tangent, *changes, *of.known(k, row, moved), threads=members)
+        of.find(step, moved)
+        for k, row, known in of.read(moved):
+            changes = velocities(row, moved_dot, "_dot"), dots.rows[k], dots.entries[k]
+            step.launch(of.kernels.read.tangent, *changes, *known, threads=members)
         if of.rows:
             step.launch(of.kernels.lengthen, of.own.whole, dots.whole, rows=len(of.rows), threads=members)
         of.solve(step, dots.whole["wanted_dot"], dots.whole["pushes_dot"])
-        for k, body, far, signs in of.ends():
-            own = of.part.bodies[body]
-            rates = {"density_dot": dot.parameters[own.table.weight]}
-            pushed = dots.side(k, far), dots.entries[k], moved_dot[body], rates
-            arrays = of.own.side(k, far), of.own.entries[k], moved[body], signs, *own.known(step)
-            step.launch(of.kernels.push.tangent, *pushed, *arrays, threads=members)
+        for k, body, far, known in of.ends(step, moved):
+            pushed = dots.side(k, far), dots.entries[k], moved_dot[body], {"density_dot": self._dot[of.weight(body)]}
+            step.launch(of.kernels.push.tangent, *pushed, *known, threads=members)
         of.push(step, moved)
 
 
 class JointsAdjoint:
-    def __init__(self, joints: Joints):
-        self._joints, self._bars = joints, JointArrays(len(joints.rows), joints.layout, "_bar")
+    """The adjoint of `Joints`, which adds to the adjoints of each body's turn in ``turned``."""
+
+    def __init__(self, joints: Joints, bar: Adjoints, turned: Sequence[Arrays]):
+        self._joints, self._bar, self._turned = joints, bar, turned
+        self._bars = JointArrays(len(joints.rows), joints.layout, "_bar")
         names, members = [f"{way}{name}" for way in ("", "other_") for name in BARS], joints.layout.members
         self._poses = zeros(dict.fromkeys(names, (members, joints.layout.precision.vector)), joints.layout.device)
 
     def begin(self) -> None:
         self._bars.clear()
 
-    def join(
-        self,
-        step: StepContext,
-        bar: Adjoints,
-        moved: Sequence[Arrays],
-        moved_bar: Sequence[Arrays],
-        turned: Sequence[Arrays],
-    ) -> None:
-        """Apply the adjoint of `Joints.join`: turn adjoints of joined velocities into those of the velocities ``moved``
-        and of each body's turn."""
+    def join(self, step: StepContext, moved: Sequence[Arrays], moved_bar: Sequence[Arrays]) -> None:
+        """Apply the adjoint of `Joints.join`: turn adjoints of joined velocities into those of the velocities
+        ``moved``."""
         of, bars, members = self._joints, self._bars, self._joints.layout.members
-        of.read(step, moved)
+        of.find(step, moved)
         bars.whole["pushes_bar"].zero_()
-        for k, body, far, signs in of.ends():
-            own = of.part.bodies[body]
-            rates = {"density_bar": bar.parameters[own.table.weight]}
-            pushed = bars.side(k, far), bars.entries[k], moved_bar[body], turned[body], rates
-            arrays = of.own.side(k, far), of.own.entries[k], moved[body], signs, *own.known(step)
-            step.launch(of.kernels.push.adjoint, *pushed, *arrays, threads=members)
+        for k, body, far, known in of.ends(step, moved):
+            rates = {**self._turned[body], "density_bar": self._bar.parameters[of.weight(body)]}
+            pushed = bars.side(k, far), bars.entries[k], moved_bar[body], rates
+            step.launch(of.kernels.push.adjoint, *pushed, *known, threads=members)
         of.solve(step, bars.whole["pushes_bar"], bars.whole["wanted_bar"], transposed=1)
-        for k, row in enumerate(of.rows):
-            changes = of.velocities(row, moved_bar, "_bar"), bars.rows[k], bars.entries[k]
-            step.launch(of.kernels.read.adjoint, *changes, *of.known(k, row, moved), threads=members)
+        for k, row, known in of.read(moved):
+            changes = velocities(row, moved_bar, "_bar"), bars.rows[k], bars.entries[k]
+            step.launch(of.kernels.read.adjoint, *changes, *known, threads=members)
         if of.rows:
             step.launch(of.kernels.spread, of.own.whole, bars.whole, rows=len(of.rows), threads=members)
 
-    def finish(self, step: StepContext, bar: Adjoints, turned: Sequence[Arrays]) -> None:
-        of, bars, members = self._joints, self._bars, self._joints.layout.members
-        for pair in of.pairs:
-            body = of.part.bodies[pair.body]
-            rates = {"density_bar": bar.parameters[body.table.weight]}
-            known = of.sides(of.own, pair), of.coefficients(pair), of.own.blocks[pair.block], *body.known(step)
-            changes = of.sides(bars, pair), bars.blocks[pair.block], rates, turned[pair.body]
-            step.launch(of.kernels.weigh.adjoint, *changes, *known, threads=members)
-        for k, row in enumerate(of.rows):
-            place = f"{row.joint.name}.position"
-            rates = {"place_bar": bar.parameters[place], "time_step_bar": bar.parameters["time_step"]}
-            known = of.own.rows[k], {"place": step.parameters[place]}, *of.poses(row)
+    def finish(self, step: StepContext) -> None:
+        of, bars, bar, members = self._joints, self._bars, self._bar, self._joints.layout.members
+        for pair, known in of.weighed(step):
+            rates = {**self._turned[pair.body], "density_bar": bar.parameters[of.weight(pair.body)]}
+            step.launch(
+                of.kernels.weigh.adjoint, bars.sides(pair), bars.blocks[pair.block], rates, *known, threads=members
+            )
+        for k, row, kernels, known in of.frames(step):
+            rates = {"place_bar": bar.parameters[row.place], "time_step_bar": bar.parameters["time_step"]}
             for array in self._poses.values():
                 array.zero_()
-            step.launch(of.frame(row).adjoint, bars.rows[k], rates, self._poses, *known, threads=members)
+            step.launch(kernels.adjoint, bars.rows[k], rates, self._poses, *known, threads=members)
             for way, number in (("", of.number(row)), ("other_", row.joint.against)):
                 bar.solids.add_whole(number, **{name: self._poses[f"{way}{name}"] for name in BARS})

@@ -35,10 +35,12 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add
 from cortado.particles.made_derivatives import made_adjoint, made_tangent
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
-from cortado.particles.pair_sums import fluid_sum, image_sum
+from cortado.particles.pair_sums import fluid_sum, image_sum, image_sum_of_solid
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
-from cortado.particles.state import Fields, Layout
+from cortado.particles.state import Fields
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm
+from cortado.solvers.particles import ParticleSystem
+from cortado.solvers.projection.effects import image_sums
 from cortado.solvers.projection.surroundings import Surroundings, SurroundingsAdjoint, SurroundingsTangent
 from cortado.solvers.projection.wall_sums import FaceShares, normal_part, types_by_name
 from cortado.sph.density import WallSums
@@ -49,42 +51,42 @@ TOPIC = "mean_stress"
 
 
 class MeanStress:
-    """The mean normal stress dt p of the sorted particles of a step. ``around`` has their surroundings, and ``at`` has
-    k and T of the last iteration."""
+    """The mean normal stress dt p of the sorted particles of a step, given surroundings, and k and T of the last
+    iteration, with their tangents or adjoints, as groups of ``known`` kernel arguments."""
 
-    def __init__(self, discretisation: Discretisation, layout: Layout, dimension: int, faces: int):
-        self._faces = FaceShares(discretisation, layout, faces)
-        self._kernels = mean_stress_kernels(discretisation, dimension)
+    def __init__(self, system: ParticleSystem):
+        discretisation, layout = system.discretisation, system.layout
+        self._faces, self._kernels = FaceShares(system), mean_stress_kernels(discretisation, system.walled.dimension)
         works = {"reach": _reach_work, "mirrors": _mirror_work}
         self._walls = {
             name: WallSums(WallTerm(discretisation, TOPIC, work, "reach_bar"), layout) for name, work in works.items()
         }
         self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
 
-    def _totals(self, context: StepContext, *around: Named) -> Named:
-        return {name: sums.total(context, ALL_WALLS, *around) for name, sums in self._walls.items()}
+    def _totals(self, context: StepContext, known: tuple[Named, ...]) -> Named:
+        return {name: sums.total(context, ALL_WALLS, *known) for name, sums in self._walls.items()}
 
-    def impulses(self, context: StepContext, around: Named, at: Named) -> wp.array:
+    def impulses(self, context: StepContext, *known: Named) -> wp.array:
         """Return the mean normal stress times the time step, dt p (n,) [Pa s]."""
         found = self._arrays["q"]
-        context.launch(self._kernels.forward, around, at, self._totals(context, around), q=found)
+        context.launch(self._kernels.forward, self._totals(context, known), *known, q=found)
         return found
 
-    def tangent(self, context: StepContext, dot: Tangents, around: tuple[Named, ...], at: Named) -> NDArray:
-        """Return the tangent (n,) of dt p; ``around`` and ``at`` include tangents."""
-        found, walls = self._arrays["q"], self._totals(context, *around)
-        dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *around) for name, one in self._walls.items()}
-        context.launch(self._kernels.tangent, *dot.named, *around, at, walls, dots, q_dot=found)
+    def tangent(self, context: StepContext, dot: Tangents, *known: Named) -> NDArray:
+        """Return the tangent (n,) of dt p."""
+        found, walls = self._arrays["q"], self._totals(context, known)
+        dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *known) for name, one in self._walls.items()}
+        context.launch(self._kernels.tangent, walls, dots, *dot.named, *known, q_dot=found)
         return np.array(found.numpy())
 
-    def adjoint(self, context: StepContext, bar: Adjoints, around: tuple[Named, ...], at: Named) -> None:
-        """From ``q_bar`` in ``at`` add to the adjoints of k, particles and ``around``."""
+    def adjoint(self, context: StepContext, bar: Adjoints, at: Named, *known: Named) -> None:
+        """From ``q_bar``, which ``at`` has with k and T, add to the adjoints of k, particles and surroundings."""
         (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
-        context.launch(own, *bar.named, at, self._totals(context, *around), reach_bar=reach_bar)
-        context.launch(pairs, *bar.named, *around, at)
-        self._faces.add(context, bar, *around, k=at["k"], q=at["q_bar"])
+        context.launch(own, self._totals(context, known), *bar.named, at, *known, reach_bar=reach_bar)
+        context.launch(pairs, *bar.named, at, *known)
+        self._faces.add(context, bar, *known, k=at["k"], q=at["q_bar"])
         for sums in self._walls.values():
-            sums.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *around)
+            sums.adjoint(context, bar, ALL_WALLS, reach_bar, reach_bar, *known)
 
 
 def spread_term(d: Discretisation) -> Any:
@@ -119,8 +121,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     typed = types_by_name(precision, {vector: "reach mirrors"})
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def images_tangent(
         x_ij, x_dot_ij, k_i, k_j, k_dot_i, k_dot_j, image_i, image_j, image_dot_i, image_dot_j, s
     ) -> real:
@@ -129,8 +130,7 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         bent = wp.dot(hessian_product(x_ij, x_ij, s) + g, x_dot_ij)
         return real(-0.5) * s.volume * (c_dot * wp.dot(g, x_ij) + c * bent)
 
-    @image_sum(discretisation)
-    @typed
+    @image_sum(discretisation, typed)
     def images_back(x_ij, k_i, k_j, image_i, image_j, q_bar_i, q_bar_j, s) -> tuple[vector, real]:
         bar, g = real(-0.5) * s.volume * (q_bar_i + q_bar_j), gradient(x_ij, s)
         bent = hessian_product(x_ij, x_ij, s) + g
@@ -140,8 +140,9 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def mean_stress(fluid: real, mirrored: real, k_i: real, reach_i: vector, mirrors_i: vector) -> real:
         return per * (fluid + mirrored - k_i * (reach_i[0] + mirrors_i[0]))
 
-    @particle_kernel(tangent_module, "q_dot", [over(spread_tangent, "fluid"), over(images_tangent, "mirrored")])
-    @typed
+    both = [over(spread_tangent, "fluid"), over(images_tangent, "mirrored")]
+
+    @particle_kernel(tangent_module, "q_dot", both, typed=typed)
     def mean_stress_tangent(fluid, mirrored, k_i, k_dot_i, reach_i, reach_dot_i, mirrors_i, mirrors_dot_i) -> real:
         change = k_dot_i * (reach_i[0] + mirrors_i[0]) + k_i * (reach_dot_i[0] + mirrors_dot_i[0])
         return per * (fluid + mirrored - change)
@@ -204,33 +205,10 @@ def pressed_kernels(precision: Precision) -> Kernels:
 @cache
 def image_load_kernels(discretisation: Discretisation) -> Kernels:
     """Make the kernels of the sum over images by the walls of ``solid``; ``y`` is p."""
-    real, vector, neighbourhood = discretisation.types
-    pair = pair_functions(discretisation)
-    gradient, hessian_product = pair.gradient, pair.hessian_product
+    real, vector, _ = discretisation.types
     module, tangent_module, adjoint_module = discretisation.modules("image_loads")
-
-    @image_sum(discretisation)
-    def load(
-        x_ij: vector, y_i: real, y_j: real, image_i: real, image_j: real, owned: real, solid: int, s: neighbourhood
-    ) -> vector:
-        return (owned * (image_i * y_i + image_j * y_j) * s.volume) * gradient(x_ij, s)
-
-    typed = types_by_name(discretisation.precision)
-
-    @image_sum(discretisation)
-    @typed
-    def load_tangent(
-        x_ij, x_dot_ij, y_i, y_j, y_dot_i, y_dot_j, image_i, image_j, image_dot_i, image_dot_j, owned, solid: int, s
-    ) -> vector:
-        c_dot = image_dot_i * y_i + image_i * y_dot_i + image_dot_j * y_j + image_j * y_dot_j
-        bent = (image_i * y_i + image_j * y_j) * hessian_product(x_ij, x_dot_ij, s)
-        return (owned * s.volume) * (c_dot * gradient(x_ij, s) + bent)
-
-    @image_sum(discretisation)
-    @typed
-    def load_back(x_ij, y_i, y_j, image_i, image_j, f_ij, owned, solid: int, s) -> tuple[real, vector]:
-        c = owned * (image_i * y_i + image_j * y_j) * s.volume
-        return owned * s.volume * wp.dot(gradient(x_ij, s), f_ij), c * hessian_product(x_ij, f_ij, s)
+    lift = image_sums(discretisation).lift
+    load, load_tangent, load_back = map(image_sum_of_solid, (lift.forward, lift.tangent, lift.adjoint))
 
     @particle_kernel(module, "total", [over(load, "found")], numbers=["solid"])
     def image_load(found: vector) -> vector:
@@ -264,10 +242,10 @@ class ImageLoads:
     arrays."""
 
     def __init__(self, density: Surroundings):
-        self._density, self._layout = density, density.layout
+        self._density, self._layout = density, density.system.layout
         self._kernels = image_load_kernels(density.discretisation)
-        self._walls = WallSums(WallTerm(density.discretisation, "image_loads", _mirrored_work, "f"), density.layout)
-        self._faces = FaceShares(density.discretisation, density.layout, density.faces)
+        self._walls = WallSums(WallTerm(density.discretisation, "image_loads", _mirrored_work, "f"), self._layout)
+        self._faces = FaceShares(density.system)
 
     def total(self, step: StepContext, solid: int, p: wp.array) -> wp.array:
         """Return the forces by pressures p (n,) [Pa] on the walls of one solid, or on all walls."""

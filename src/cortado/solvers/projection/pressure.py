@@ -115,8 +115,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     names = {seen: "of", bars: "bar", six: "S T", neighbourhood: "s", vector: "x g u", matrix: "A", iterate: "at"}
     typed = TypesByName(real, names)
 
-    @wp.kernel(module=module)
-    @typed.arrays
+    @typed.kernel(module)
     def update(
         s, omega: real, beta: real, time_step, x, n, of: shared, at, k_out, y_out, T, error: wp.array(dtype=pair_of)
     ):
@@ -151,8 +150,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
         T[i] = later * pack(of.L[i])
         error[i] = pair_of(of.coarse[i] * (dt * left) * (dt * left), of.coarse[i])
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(tangent_module)
     def update_tangent(
         s, omega: real, beta: real, time_step, time_step_dot, x, x_dot, n, n_dot, of, at, dot: moving, out: moved
     ):
@@ -180,8 +178,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
         out.y_out_dot[i] = found + beta * (found - dot.k[i])  # before k, which may be the same array
         out.k_out_dot[i] = found
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(adjoint_module)
     def clamp_adjoint(
         particles: int, omega: real, beta: real, time_step, n, of, at: iterate, k_bar, y_bar, bar, d_bar, S
     ):
@@ -272,8 +269,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
 
     begun = wp.func(start, module=modules[0])
 
-    @wp.kernel(module=modules[0])
-    @typed.arrays
+    @typed.kernel(modules[0])
     def begin(
         particles: int, spacing: real, time_step, k_before, kick_before, beside, v_star, surfaced, weights, first, warm
     ):
@@ -289,14 +285,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
         if not (pressure <= real(0.0)) and warm[member] == 0:
             warm[member] = 1
 
-    made = pointwise_kernels(
-        precision,
-        modules,
-        lambda _: start,
-        ["weights", "k", "y", "u"],
-        {"weights": "weights"},
-        numbers=["spacing"],
-        known=["time_step", "beside", "surfaced"],
-        written=["k_before", "kick_before"],
-    )
-    return replace(made, forward=begin)
+    roles: dict[str, Any] = {"numbers": ["spacing"], "known": ["time_step", "beside", "surfaced"]}
+    results, replaced = ["weights", "k", "y", "u"], {"weights": "weights"}
+    roles |= {"written": ["k_before", "kick_before"], "replaced": replaced}
+    return replace(pointwise_kernels(precision, modules, lambda _: start, results, **roles), forward=begin)

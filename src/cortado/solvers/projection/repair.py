@@ -64,8 +64,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     typed = TypesByName(real, {neighbourhood: "s", seen: "of dot", vector: "x pushed lifted gamma f", bars: "bar"})
 
-    @wp.kernel(module=module)
-    @typed.arrays
+    @typed.kernel(module)
     def measure(s, omega: real, of, x_now, c_in, c_out, excess, error: wp.array(dtype=pair_of)):
         """Compute lambda' from densities; ``c`` is lambda, ``excess`` n - 1, and ``error`` has the compression
         twice."""
@@ -84,8 +83,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
         excess[i] = over
         error[i] = pair_of(compression, compression)
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(tangent_module)
     def measure_tangent(s, omega: real, of, dot, x_now, x_now_dot, c_in, c_in_dot, excess, c_out_dot):
         i = s.first + wp.tid() // LANES
         total = s.volume * weights_tangent(i, x_now, x_now_dot, s)
@@ -102,8 +100,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
             z_dot = of.weights[i][3] * z_dot + dot.weights[i][3] * z
         c_out_dot[i] = z_dot
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(adjoint_module)
     def measure_adjoint(s, x_now, image, n_now_bar, image_bar, x_now_bar):
         i = s.first + wp.tid() // LANES
         total = weights_adjoint(i, x_now, n_now_bar, s)
@@ -130,8 +127,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     both = [over(push_tangent, "pushed"), over(lift_tangent, "lifted", y="c", y_dot="c_dot")]
 
-    @particle_kernel(tangent_module, "x_now_dot", both)
-    @typed
+    @particle_kernel(tangent_module, "x_now_dot", both, typed=typed)
     def move_tangent(
         pushed, lifted, m_i, m_dot_i, gamma_i, gamma_dot_i, c_i, c_dot_i, x_moved_i, x_moved_dot_i, x_now_i, held_i
     ) -> vector:
@@ -148,8 +144,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
         bar = along(x_now_bar_i, back, held_i)
         return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(adjoint_module)
     def move_adjoint(s, omega: real, x, of, c_in, c_out, excess, f, c_bar, bar, n_now_bar):
         """Apply the adjoint of the sum over neighbours in x_k+1, and of lambda' with respect to n."""
         i = s.first + wp.tid() // LANES

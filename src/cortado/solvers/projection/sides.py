@@ -108,8 +108,7 @@ def side_kernels(precision: Precision) -> Kernels:
             y = start
         return y, used, stays
 
-    @wp.kernel(module=modules[0], enable_backward=False)
-    @typed.arrays
+    @typed.kernel(modules[0])
     def keep(s, sheets, k: int, least: real, x, x_now, x_kept):
         i = s.first + wp.tid()
         member = i // s.particles
@@ -130,8 +129,7 @@ def side_kernels(precision: Precision) -> Kernels:
         grown = s.scales_dot[member, k] / s.scales[member, k]
         return moved[member, k] + wp.cross(turned[member, k], arm) + grown * arm
 
-    @wp.kernel(module=modules[1], enable_backward=False)
-    @typed.arrays
+    @typed.kernel(modules[1])
     def keep_tangent(s, sheets, k: int, least: real, x, x_dot, x_now, x_kept, x_now_dot):
         i = s.first + wp.tid()
         member, number = i // s.particles, sheets.numbers[k]
@@ -158,8 +156,7 @@ def side_kernels(precision: Precision) -> Kernels:
             change += twist(x_kept[i], s.after, s.after_dot, s.turned_dot, number, member, s)
         x_now_dot[i] = change
 
-    @wp.kernel(module=modules[2], enable_backward=False)
-    @typed.arrays
+    @typed.kernel(modules[2])
     def keep_adjoint(s, sheets, k: int, least: real, x, x_now, x_kept, x_now_bar, bar):
         i = s.first + wp.tid()
         member, number = i // s.particles, sheets.numbers[k]

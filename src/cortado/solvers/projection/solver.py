@@ -4,7 +4,6 @@ gather."""
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from math import inf
 
 import warp as wp
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from cortado.particles.state import Parameters, State
 from cortado.particles.wall_terms import solid_kernel
 from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.build import SolverSetting, particle_system
-from cortado.solvers.loop import LoopLimits
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.pcisph.solver import Pcisph
 from cortado.solvers.projection.bodies import BodiesAdjoint, BodiesTangent
@@ -38,60 +36,82 @@ class ProjectionTangent(ParticleTangent):
     def __init__(self, solver: ProjectionSteps, parameters_dot: Parameters):
         super().__init__(solver, parameters_dot)
         self._solver: ProjectionSteps = solver
+        layout, precision = solver.layout, solver.layout.precision
+        vectors = dict.fromkeys(("x_star", "v_star", "kick", "u", "delta", "x_moved", "x_now"), precision.vector)
+        numbers = dict.fromkeys("kyc", precision.real)
+        own = layout.arrays("_dot", **vectors, **numbers, A=precision.matrix, T=precision.six)
+        v_end = own["u_dot"] if solver.following is None else solver.vectors()
+        shared = {"v_new": "u", "u_out": "u", "k_out": "k", "y_out": "y", "c_in": "c", "c_out": "c"}
+        self._own: dict[str, wp.array] = {
+            **own,
+            **{f"{name}_dot": own[f"{other}_dot"] for name, other in shared.items()},
+            **{"v_end_dot": v_end, **layout.arrays(T=precision.six)},
+            **{"k_before_dot": self.carried_dot[IMPULSE], "kick_before_dot": self.carried_dot[KICK]},
+        }
+        """Tangents of the arrays of a step, by names of kernel arguments."""
         self._around = self.density.around
-        self._pull = solver.layout.arrays(T=solver.pull.dtype, T_dot=solver.pull.dtype)
-        self._x_star_dot, self._v_star_dot, self._kick_dot = (solver.vectors() for _ in range(3))
-        self._u_dot, self._delta_dot, self._x_moved_dot, self._x_now_dot = (solver.vectors() for _ in range(4))
-        self._v_end_dot = self._u_dot if solver.following is None else solver.vectors()
-        self._k_dot, self._y_dot, self._c_dot = (solver.numbers() for _ in range(3))
-        self._A_dot = wp.zeros_like(solver.iterates[0]["A"])
-        free = [part for part in self._parts if isinstance(part, FreeSolidsTangent)]
-        self._bodies = None if solver.bodies is None else BodiesTangent(solver.bodies, free[0].bodies)
-        self._coarse = CoarseTangent(solver.coarse, solver.layout, self._bodies, self.dot)
+        self._known = self._own, *self.dot.named, self._around, solver.known
+        self._bodies = None
+        if solver.bodies is not None:
+            (part,) = (part for part in self._parts if isinstance(part, FreeSolidsTangent))
+            self._bodies = BodiesTangent(solver.bodies, part.bodies, self.dot, self._around)
+        self._coarse = CoarseTangent(solver.coarse, layout, self._bodies, self._known)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
-        solver, kernels = self._solver, self._solver.kernels
-        context = solver.context(parameters)
+        solver, kernels, own, known = self._solver, self._solver.kernels, self._own, self._known
+        context, (iterations, repairs) = solver.context(parameters), counts
         self.sort(context, state_dot)
-        known = (*self.dot.named, self._around, solver.around)
         if self._bodies is not None:
-            pressures = solver.carried[IMPULSE], self.carried_dot[IMPULSE]
-            self._bodies.begin(context, self.dot, solver.around, self._around, pressures)
-        self.predict(context, solver.v_star, self._x_star_dot, self._v_star_dot)
-        self._project(context, known, counts[0])
-        v_new = {"v_new": solver.iterates[counts[0]]["u"], "v_new_dot": self._u_dot}
-        flow = {"A": solver.last_gradient(counts[0]), "A_dot": self._A_dot}
-        pull = {"k": solver.iterates[counts[0]]["k"], "k_dot": self._k_dot}
-        context.launch(kernels.shift.tangent, *known, solver.spaced, flow, pull, delta_dot=self._delta_dot)
-        moved = {"x_moved_dot": self._x_moved_dot, "delta": solver.delta, "delta_dot": self._delta_dot}
-        context.launch(kernels.moving.tangent, *known, v_new, moved)
-        wp.copy(self._x_now_dot, self._x_moved_dot)
-        self._c_dot.zero_()
-        omegas = solver.repair_relaxations
-        for k in range(counts[1]):
-            at, new = solver.repaired[k], solver.repaired[k + 1]
-            measured = {"x_now": at["x_now"], "c_in": at["c"], "excess": at["excess"]}
-            change = {"x_now_dot": self._x_now_dot, "c_in_dot": self._c_dot, "c_out_dot": self._c_dot}
-            context.launch(kernels.repair.measure.tangent, *known, measured, change, omega=omegas[k])
-            there = {"c": new["c"], "x_moved": solver.x_moved, "x_now": new["x_now"], "held": new["held"]}
-            change = {"c_dot": self._c_dot, "x_moved_dot": self._x_moved_dot, "x_now_dot": self._x_now_dot}
-            context.launch(kernels.repair.move.tangent, *known, there, change)
+            self._bodies.begin(context, solver.carried[IMPULSE], self.carried_dot[IMPULSE])
+        self.predict(context, solver.known["v_star"], own["x_star_dot"], own["v_star_dot"])
+        context.launch(kernels.beginning.tangent, *known)
+        self._coarse.begin(context)
+        for k in range(iterations):
+            self._iterate(context, k)
+        if self._bodies is not None:
+            self._bodies.settle(context, solver.iterates[iterations]["y"], own["y_dot"])
+        end = solver.end_of(iterations)
+        context.launch(kernels.shift.tangent, end, *known)
+        context.launch(kernels.moving.tangent, end, *known)
+        wp.copy(own["x_now_dot"], own["x_moved_dot"])
+        own["c_dot"].zero_()
+        for k in range(repairs):
+            at, omega = solver.repaired[k], solver.repair_relaxations[k]
+            context.launch(kernels.repair.measure.tangent, at, *known, c_in=at["c"], omega=omega)
+            context.launch(kernels.repair.move.tangent, solver.repaired[k + 1], *known)
+        last = solver.repaired[repairs]
         if solver.following is not None:
-            ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_dot": self._x_now_dot}
-            context.launch(solver.following.tangent, *known, flow, v_new, ends, v_end_dot=self._v_end_dot)
+            context.launch(solver.following.tangent, end, last, *known)
         if solver.sides is not None:
-            solver.sides.tangent(context, self.dot, solver.repaired[counts[1]]["x_now"], self._x_now_dot)
-        carried = {IMPULSE: self._k_dot, KICK: self._kick_dot}
-        self.unsort(context, self._x_now_dot, self._v_end_dot, state_dot, **carried)
+            solver.sides.tangent(context, self.dot, last["x_now"], own["x_now_dot"])
+        carried = {IMPULSE: own["k_dot"], KICK: own["kick_dot"]}
+        self.unsort(context, own["x_now_dot"], own["v_end_dot"], state_dot, **carried)
+
+    def _iterate(self, context: StepContext, k: int) -> None:
+        solver, kernels, known = self._solver, self._solver.kernels, self._known
+        old, at, new = solver.iterates[k], solver.corrected[k], solver.iterates[k + 1]
+
+        def correct() -> None:
+            self._coarse.correct(context, k, {"drift_dot": self._drift(context, old)}, old, at)
+
+        solver.coarse.where_due(k, correct)
+        drift, beta = self._drift(context, at), solver.momentum(k)
+        context.launch(kernels.pressure.update.tangent, at, *known, drift_dot=drift, beta=beta)
+        context.launch(kernels.velocity.pull_tangent, new, *known)
+        context.launch(kernels.velocity.velocity.tangent, new, *known)
+
+    def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
+        drift_dot, y_dot = self._around["drift_dot"], self._own["y_dot"]
+        return drift_dot if self._bodies is None else self._bodies.drifted(context, drift_dot, at["y"], y_dot)
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        return self._over_time(self._solver.iterates[rounds[0]]["k"], self._k_dot.numpy())
+        return self._over_time(self._solver.iterates[rounds[0]]["k"], self._own["k_dot"].numpy())
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
-        solver, at = self._solver, {**self._pull, "k": self._solver.iterates[rounds[0]]["k"], "k_dot": self._k_dot}
-        context, around = solver.context(solver.parameters), (solver.around, self._around)
-        change = solver.mean_stress.tangent(context, self.dot, around, at)
-        return self._over_time(solver.mean_stress.impulses(context, solver.around, at), change)
+        solver = self._solver
+        context, known = solver.context(solver.parameters), (solver.iterates[rounds[0]], *self._known)
+        change = solver.mean_stress.tangent(context, self.dot, *known)
+        return self._over_time(solver.mean_stress.impulses(context, *known), change)
 
     def _over_time(self, impulses: wp.array, change: NDArray) -> NDArray:
         """Return the tangent of impulses divided by the time step, given the tangent of the impulses."""
@@ -100,45 +120,6 @@ class ProjectionTangent(ParticleTangent):
         found: NDArray = change / dt - impulses.numpy() * dt_dot / dt**2
         return found
 
-    def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        solver, kernels = self._solver, self._solver.kernels.pressure
-        beginning = solver.kernels.beginning
-        before = {"k_before": solver.carried[IMPULSE], "k_before_dot": self.carried_dot[IMPULSE]}
-        before |= {"kick_before": solver.carried[KICK], "kick_before_dot": self.carried_dot[KICK]}
-        before |= {"surfaced": solver.density.surfaced, "v_star": solver.v_star}
-        change = {"u_dot": self._u_dot, "y_dot": self._y_dot, "k_dot": self._k_dot}
-        context.launch(beginning.tangent, *known, solver.spaced, before, change, v_star_dot=self._v_star_dot)
-        self._coarse.begin(context, known)
-        for k in range(iterations):
-            at = solver.corrected[k]
-            solver.coarse.where_due(k, partial(self._correct, context, known, k, change))
-            drift = self._drift(context, at)
-            new = {"A_dot": self._A_dot, "k_out_dot": self._k_dot, "y_out_dot": self._y_dot}
-            beta = solver.momentum(k)
-            context.launch(kernels.update.tangent, *known, at, solver.relaxed, change, new, **drift, beta=beta)
-            self._press(context, known, solver.iterates[k + 1])
-        if self._bodies is not None:
-            self._bodies.settle(context, self.dot, solver.iterates[iterations]["y"], self._y_dot)
-
-    def _correct(self, context: StepContext, known: tuple[Named, ...], k: int, change: dict[str, wp.array]) -> None:
-        before = {**self._solver.iterates[k], **change}
-        drift = self._drift(context, before)
-        self._coarse.correct(context, k, (drift, *known), before, self._solver.corrected[k])
-
-    def _drift(self, context: StepContext, at: dict[str, wp.array]) -> dict[str, wp.array]:
-        if self._bodies is None:
-            return {}
-        drift_dot = self._around["drift_dot"]
-        return {"drift_dot": self._bodies.drifted(context, self.dot, drift_dot, at["y"], self._y_dot)}
-
-    def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        solver, kernels = self._solver, self._solver.kernels.velocity
-        pull = {**self._pull, "y": at["y"], "y_dot": self._y_dot}
-        context.launch(kernels.pull_tangent, *known, pull)
-        predicted = {"v_star": solver.v_star, "v_star_dot": self._v_star_dot}
-        found = {"u": at["u"], "u_dot": self._u_dot, "kick_dot": self._kick_dot}
-        context.launch(kernels.velocity.tangent, *known, pull, predicted, found)
-
 
 class ProjectionAdjoint(ParticleAdjoint):
     density: SurroundingsAdjoint
@@ -146,57 +127,62 @@ class ProjectionAdjoint(ParticleAdjoint):
     def __init__(self, solver: ProjectionSteps, steps: int):
         super().__init__(solver, steps)
         self._solver: ProjectionSteps = solver
+        layout, precision = solver.layout, solver.layout.precision
+        vectors = dict.fromkeys(("x_now", "x_moved", "u", "kick", "kick_before"), precision.vector)
+        numbers = dict.fromkeys(("k", "k_before", "y", "c", "d", "q", "n_now"), precision.real)
+        own = layout.arrays("_bar", **vectors, **numbers, A=precision.matrix)
+        shared = {"v_new": "u", "delta": "x_moved", "k_out": "k"}
+        self._own: dict[str, wp.array] = {
+            **own,
+            **{f"{name}_bar": own[f"{other}_bar"] for name, other in shared.items()},
+            **layout.arrays(f=precision.vector, S=precision.six, T=precision.six),
+            "v_star_bar": self.bar.fields["v"],
+        }
+        """Adjoints of the arrays of a step, by names of kernel arguments; f is that of the force."""
+        self.bar = replace(self.bar, kick=own["kick_before_bar"])
         self._around = self.density.around
-        self._x_now_bar, self._x_moved_bar, self._u_bar, self._f = (solver.vectors() for _ in range(4))
-        self._kick_bar, self._kick_before_bar = (solver.vectors() for _ in range(2))
-        self.bar = replace(self.bar, kick=self._kick_before_bar)
-        self._A_bar = wp.zeros_like(solver.iterates[0]["A"])
-        self._faces = FaceShares(solver.discretisation, solver.layout, len(solver.system.faces.solids))
-        self._pull, push = (wp.zeros_like(solver.pull) for _ in range(2))
-        self._m_unused, self._k_before_bar, self._n_now_bar = (solver.numbers() for _ in range(3))
-        self._k_bar, self._y_bar, self._c_bar, d_bar, self._q_bar = (solver.numbers() for _ in range(5))
-        free = [part for part in self._parts if isinstance(part, FreeSolidsAdjoint)]
-        self._bodies = None if solver.bodies is None else BodiesAdjoint(solver.bodies, free[0].bodies)
-        self._steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "d_bar": d_bar, "S": push}
-        self._drift_bar = {} if self._bodies is None else {"drift_bar": self._bodies.drift_bar}
-        self._coarse = CoarseAdjoint(solver.coarse, solver.layout, self._bodies, self.bar, self._faces)
+        self._known = self._own, *self.bar.named, self._around, solver.known
+        self._faces = FaceShares(solver.system)
+        self._m_unused, self._bodies = solver.numbers(), None
+        self._drift_bar: dict[str, wp.array] = {}
+        if solver.bodies is not None:
+            (part,) = (part for part in self._parts if isinstance(part, FreeSolidsAdjoint))
+            self._bodies = BodiesAdjoint(solver.bodies, part.bodies, self.bar, self._around)
+            self._drift_bar = {"drift_bar": self._bodies.drift_bar}
+        self._coarse = CoarseAdjoint(solver.coarse, layout, self._bodies, self.bar, self._faces, self._known)
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
         self._begin(state_bar, parameters)
         self._go_back(counts, state_bar, parameters)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        solver = self._solver
+        solver, own = self._solver, self._own
         state_bar.clear()
         self._begin(state_bar, parameters)
-        context, known = solver.context(parameters), self.bar.named
-        pressed, k = pressed_kernels(solver.layout.precision).adjoint, solver.iterates[counts[0]]["k"]
-        context.launch(pressed, *known, impulse=k, p_bar=within.p, impulse_bar=self._k_bar)
+        context, last = solver.context(parameters), solver.iterates[counts[0]]
+        pressed = pressed_kernels(solver.layout.precision).adjoint
+        context.launch(pressed, *self._known, impulse=last["k"], p_bar=within.p, impulse_bar=own["k_bar"])
         if within.stress is not None:
-            self._q_bar.zero_()
-            at = {"k": k, "T": solver.pull, "k_bar": self._k_bar, "q_bar": self._q_bar}
-            q = solver.mean_stress.impulses(context, solver.around, at)
-            context.launch(pressed, *known, impulse=q, p_bar=within.stress, impulse_bar=at["q_bar"])
-            solver.mean_stress.adjoint(context, self.bar, (solver.around, self._around), at)
+            own["q_bar"].zero_()
+            q = solver.mean_stress.impulses(context, last, solver.known)
+            context.launch(pressed, *self._known, impulse=q, p_bar=within.stress, impulse_bar=own["q_bar"])
+            at = {"k": last["k"], "T": solver.known["T"], "q_bar": own["q_bar"]}
+            solver.mean_stress.adjoint(context, self.bar, at, *self._known)
         self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
         """Turn the adjoint of a step's result into the adjoints of the last positions, velocities and k."""
-        solver, context = self._solver, self._solver.context(parameters)
+        solver, own, context = self._solver, self._own, self._solver.context(parameters)
         free_bar = self.unsort(context, state_bar)
-        scene = {
-            "x_scene": free_bar.positions,
-            "v_scene": free_bar.velocities,
-            "m_scene": state_bar["reference_density"],
-        }
-        new = {"x": self._x_now_bar, "v": self._u_bar, "m": self._m_unused}
-        context.launch(solver.integration.sort, scene, new)
-        own = (self._x_moved_bar, self._c_bar, self._y_bar, self._A_bar)
-        for array in (*self.bar.fields.arrays(), *own):
+        scene = {"x_scene": free_bar.positions, "v_scene": free_bar.velocities}
+        scene |= {"m_scene": state_bar["reference_density"], "m": self._m_unused}
+        context.launch(solver.integration.sort, scene, x=own["x_now_bar"], v=own["u_bar"])
+        kept = (own[f"{name}_bar"] for name in ("x_moved", "c", "y", "A"))
+        for array in (*self.bar.fields.arrays(), *kept):
             array.zero_()
         self.density.begin()
-        wp.copy(self._k_bar, self.carried_bar[IMPULSE])
-        wp.copy(self._kick_bar, self.carried_bar[KICK])
+        wp.copy(own["k_bar"], self.carried_bar[IMPULSE])
+        wp.copy(own["kick_bar"], self.carried_bar[KICK])
         if self._bodies is not None:
             self._bodies.begin()
 
@@ -204,103 +190,77 @@ class ProjectionAdjoint(ParticleAdjoint):
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
         """Turn the adjoints that `_begin` wrote into the adjoint of the state, through the step in reverse."""
-        solver, kernels, context = self._solver, self._solver.kernels, self._solver.context(parameters)
-        known = (*self.bar.named, self._around, solver.around)
-        last = solver.iterates[counts[0]]
-        flow = {"A": solver.last_gradient(counts[0]), "A_bar": self._A_bar}
-        v_new = {"v_new": last["u"], "v_new_bar": self._u_bar}
+        solver, kernels, own, known = self._solver, self._solver.kernels, self._own, self._known
+        context, (iterations, repairs) = solver.context(parameters), counts
+        end, last = solver.end_of(iterations), solver.repaired[repairs]
         if solver.sides is not None:
-            solver.sides.adjoint(context, self.bar, solver.repaired[counts[1]]["x_now"], self._x_now_bar)
+            solver.sides.adjoint(context, self.bar, last["x_now"], own["x_now_bar"])
         if solver.following is not None:
-            ends = {"x_now": solver.repaired[counts[1]]["x_now"], "x_now_bar": self._x_now_bar}
-            context.launch(solver.following.adjoint, *known, flow, v_new, ends)
-        self._mend(context, known, counts[1])
-        context.launch(kernels.moving.adjoint, *known, v_new, delta=solver.delta, delta_bar=self._x_moved_bar)
-        pull = {"k": last["k"], "k_bar": self._k_bar}
-        context.launch(kernels.shift.adjoint, *known, solver.spaced, flow, pull, delta_bar=self._x_moved_bar)
-        self._project(context, known, counts[0])
-        before = {"k_before": solver.carried[IMPULSE], "k_before_bar": self._k_before_bar}
-        before |= {"kick_before": solver.carried[KICK], "kick_before_bar": self._kick_before_bar}
-        before |= {"surfaced": solver.density.surfaced, "v_star": solver.v_star}
-        steps = {"k_bar": self._k_bar, "y_bar": self._y_bar, "u_bar": self._u_bar, "v_star_bar": self.bar.fields["v"]}
-        context.launch(kernels.beginning.adjoint, *known, solver.spaced, before, steps)
+            context.launch(solver.following.adjoint, end, last, *known)
+        for k in reversed(range(repairs)):
+            self._mend(context, k)
+        add(own["x_now_bar"], own["x_moved_bar"])
+        context.launch(kernels.moving.adjoint, end, *known)
+        context.launch(kernels.shift.adjoint, end, *known)
         if self._bodies is not None:
-            self._bodies.finish(context, self.bar, solver.around, self._around)
+            self._bodies.settle(context, solver.iterates[iterations]["y"], own["y_bar"])
+        self._coarse.begin()
+        for k in reversed(range(iterations)):
+            self._iterate(context, k, moves=k == iterations - 1)
+        self._coarse.finish(context)
+        context.launch(kernels.beginning.adjoint, *known)
+        if self._bodies is not None:
+            self._bodies.finish(context)
         context.launch(kernels.velocity.time_adjoint, *known, acceleration=solver.accelerations[-1])
         self.predict(context, within)
         if self._bodies is not None:
-            pressures = solver.carried[IMPULSE], self._k_before_bar
-            self._bodies.release(context, self.bar, solver.around, self._around, pressures)
+            self._bodies.release(context, solver.carried[IMPULSE], own["k_before_bar"])
         self.mix(context, state_bar)
-        self.sort(context, state_bar, **{IMPULSE: self._k_before_bar, KICK: self._kick_before_bar})
+        self.sort(context, state_bar, **{IMPULSE: own["k_before_bar"], KICK: own["kick_before_bar"]})
 
-    def _mend(self, context: StepContext, known: tuple[Named, ...], repairs: int) -> None:
-        solver, kernels = self._solver, self._solver.kernels.repair
-        begin, move = kernels.move.adjoint
-        for k in reversed(range(repairs)):
-            at, new = solver.repaired[k], solver.repaired[k + 1]
-            bars = {"x_now_bar": self._x_now_bar, "x_moved_bar": self._x_moved_bar, "f": self._f}
-            context.launch(begin, *known, bars, x_now=new["x_now"], held=new["held"], x_moved=solver.x_moved)
-            measured = {"c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
-            own = {"c_bar": self._c_bar, "n_now_bar": self._n_now_bar, "f": self._f}
-            context.launch(move, *known, measured, own, omega=solver.repair_relaxations[k])
-            own = {"x_now": at["x_now"], "n_now_bar": self._n_now_bar, "x_now_bar": self._x_now_bar}
-            context.launch(kernels.measure.adjoint, *known, own)
-            own = {**own, "x": at["x_now"]}
-            self._faces.add(context, self.bar, context.fields.named(), solver.around, u=self._f, spread=new["c"])
-            self._faces.add(context, self.bar, solver.around, own, weighted=self._n_now_bar)
-            densities = partial(solid_kernel, solver.discretisation, "projection", repair_term)
-            self.bar.solids.add(context.launch, densities, *known, own)
-        add(self._x_now_bar, self._x_moved_bar)
+    def _mend(self, context: StepContext, k: int) -> None:
+        solver, kernels, own, known = self._solver, self._solver.kernels.repair, self._own, self._known
+        at, new, (begin, move) = solver.repaired[k], solver.repaired[k + 1], kernels.move.adjoint
+        context.launch(begin, new, *known)
+        changes = {"c_in": at["c"], "c_out": new["c"], "omega": solver.repair_relaxations[k]}
+        context.launch(move, changes, at, *known)
+        context.launch(kernels.measure.adjoint, at, *known)
+        self._faces.add(context, self.bar, *known, u=own["f"], spread=new["c"])
+        self._faces.add(context, self.bar, *known, x=at["x_now"], weighted=own["n_now_bar"])
+        densities = partial(solid_kernel, solver.discretisation, "projection", repair_term)
+        self.bar.solids.add(context.launch, densities, *known, x=at["x_now"])
 
-    def _project(self, context: StepContext, known: tuple[Named, ...], iterations: int) -> None:
-        solver = self._solver
-        if self._bodies is not None:
-            self._bodies.settle(context, self.bar, solver.iterates[iterations]["y"], self._y_bar)
-        self._coarse.begin()
-        for k in reversed(range(iterations)):
-            self._press(context, known, solver.iterates[k + 1])
-            self._back(context, known, solver.corrected[k], solver.momentum(k), moves=k == iterations - 1)
-            solver.coarse.where_due(k, partial(self._correct, context, known, k))
-        self._coarse.finish(context, known, solver.around["coarse"])
+    def _iterate(self, context: StepContext, k: int, moves: bool) -> None:
+        """Apply the adjoint of one pressure iteration. With ``moves`` A has an adjoint too, because the iteration's A
+        moves particles."""
+        solver, own, known = self._solver, self._own, self._known
+        velocity, pressure = solver.kernels.velocity, solver.kernels.pressure
+        (clamp, divergence, whole), more = pressure.update.adjoint, dict[str, wp.array]()
+        old, at, new = solver.iterates[k], solver.corrected[k], solver.iterates[k + 1]
 
-    def _correct(self, context: StepContext, known: tuple[Named, ...], k: int) -> None:
-        solver, at = self._solver, self._solver.iterates[k]
-        self._coarse.correct(context, k, (self._drift_bar, *known), at, solver.corrected[k], self._steps, self._u_bar)
-        wp.copy(self._f, self._u_bar)
-        self._diverge(context, known, solver.kernels.pressure.update.adjoint[1], at, self._steps)
-        add(self._f, self._u_bar)
+        def correct() -> None:
+            self._coarse.correct(context, k, self._drift_bar, old, at)
+            wp.copy(own["f"], own["u_bar"])
+            self._diverge(context, divergence, old, {})
+            add(own["f"], own["u_bar"])
 
-    def _press(self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array]) -> None:
-        solver, velocity = self._solver, self._solver.kernels.velocity
-        found = {"u": at["u"], "u_bar": self._u_bar, "kick_bar": self._kick_bar, "v_star": solver.v_star}
-        steps = {"f": self._f, "T": self._pull, "y": at["y"]}
-        context.launch(velocity.own_adjoint, *known, found, steps)
-        context.launch(velocity.velocity.adjoint, *known, steps, y_bar=self._y_bar)
-        self._faces.add(context, self.bar, context.fields.named(), solver.around, u=self._f, spread=at["y"])
-
-    def _back(
-        self, context: StepContext, known: tuple[Named, ...], at: dict[str, wp.array], beta: float, moves: bool
-    ) -> None:
-        """Apply the adjoint of one pressure iteration, from k' and y' to k, y and u. With ``moves`` A has an adjoint
-        too, because the iteration's A moves particles."""
-        solver, pressure = self._solver, self._solver.kernels.pressure
-        (clamp, divergence, whole), steps = pressure.update.adjoint, self._steps
-        context.launch(clamp, *known, at, solver.relaxed, steps, **self._drift_bar, beta=beta)
+        context.launch(velocity.own_adjoint, new, *known)
+        context.launch(velocity.velocity.adjoint, new, *known)
+        self._faces.add(context, self.bar, *known, u=own["f"], spread=new["y"])
+        context.launch(clamp, self._drift_bar, at, *known, beta=solver.momentum(k))
         if moves:
-            context.launch(pressure.whole_adjoint, *known, steps, A_bar=self._A_bar)
-            divergence, steps = whole, {**steps, "S": self._A_bar}
-        self._diverge(context, known, divergence, at, steps)
+            context.launch(pressure.whole_adjoint, *known)
+            more = {"S": own["A_bar"]}
+        self._diverge(context, whole if moves else divergence, at, more)
+        solver.coarse.where_due(k, correct)
 
-    def _diverge(
-        self, context: StepContext, known: tuple[Named, ...], kernel: wp.Kernel, at: dict[str, wp.array], steps: Named
-    ) -> None:
-        """Turn the adjoints d_bar and S in ``steps`` into the adjoint of u."""
-        context.launch(kernel, *known, at, steps, u_bar=self._u_bar)
-        around = context.fields.named(), self._solver.around
-        self._faces.add(context, self.bar, *around, u=at["u"], spread=steps["d_bar"])
+    def _diverge(self, context: StepContext, kernel: wp.Kernel, at: Named, more: Named) -> None:
+        """Turn the adjoints d_bar and S into the adjoint of u."""
+        own, known = self._own, self._known
+        context.launch(kernel, more, at, *known)
+        self._faces.add(context, self.bar, *known, u=at["u"], spread=own["d_bar"])
         if self._bodies is not None:
-            self._bodies.drifted(context, self.bar, self._around["drift_bar"], at["y"], self._y_bar)
+            self._bodies.drifted(context, self._around["drift_bar"], at["y"], own["y_bar"])
 
 
 class Projection(ProjectionSteps):
@@ -330,11 +290,7 @@ class ProjectionMaker:
             )
         grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
         constants = lattice_constants(setting.scene, setting.discrete)
-        limits = LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
-        if table.tolerance is not None:
-            limits = LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)
-        own = table.repairs, table.velocities_follow, grid, endless(setting.discrete)
-        return Projection(system, constants, limits, *own)
+        return Projection(system, table, constants, grid, endless(setting.discrete))
 
 
 maker = ProjectionMaker

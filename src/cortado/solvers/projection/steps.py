@@ -27,7 +27,9 @@ The repairs of density begin from x + dt v + delta.
 """
 
 from functools import cache, cached_property
+from math import inf
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -38,6 +40,7 @@ from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Parameters, State, StateField
+from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.loop import ROOT_MEAN_SQUARE, IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
@@ -145,19 +148,14 @@ class ProjectionSteps(ParticleSolver):
     carried_fields = (StateField(IMPULSE, "Pa s", Entry.NUMBER), StateField(KICK, "m/s", Entry.VECTOR))
 
     def __init__(
-        self,
-        system: ParticleSystem,
-        constants: ProjectionConstants,
-        limits: LoopLimits,
-        repairs: int,
-        follow: bool,
-        grid: Grid,
-        endless: bool,
+        self, system: ParticleSystem, table: ProjectionSolver, constants: ProjectionConstants, grid: Grid, endless: bool
     ):
-        """Prepare steps with pressure iterations within ``limits`` and ``repairs`` repairs of density each. With
-        ``follow`` velocities follow the shift and the repairs. A coarse ``grid`` corrects the pressure between
-        iterations, in a cold scene also before the first iteration, and never in an ``endless`` scene."""
-        self.constants = constants
+        """Prepare steps with the iterations and repairs of a scene's ``table``. A coarse ``grid`` corrects the pressure
+        between iterations, in a cold scene also before the first iteration, and never in an ``endless`` scene."""
+        self.constants, repairs = constants, table.repairs
+        limits = LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
+        if table.tolerance is not None:
+            limits = LoopLimits(table.iterations, table.maximum_iterations, table.tolerance, inf)
         super().__init__(system)
         own = self.discretisation, system.walled.dimension
         self.kernels = SimpleNamespace(
@@ -168,12 +166,8 @@ class ProjectionSteps(ParticleSolver):
             moving=moving_kernels(self.discretisation.precision),
             repair=repair_kernels(*own),
         )
-        self.relaxed = {"omega": constants.relaxation}
-        self.spaced = {**self.density.constants, "spacing": constants.spacing}
         precision = self.layout.precision
         real, vector = precision.real, precision.vector
-        self.pull = self.layout.arrays(T=symmetric(precision).kind)["T"]
-        """y L of the present iteration."""
         kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates = [self.layout.arrays(**self._iterate_kinds)]
@@ -182,14 +176,24 @@ class ProjectionSteps(ParticleSolver):
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
         """Values before each repair: positions x_k, lambda, n - 1, and the part of the full displacement that moved a
         particle."""
-        self.x_star, self.v_star, self.kick, self.x_moved, self.delta = (self.vectors() for _ in range(5))
+        vectors = dict.fromkeys(("x_star", "v_star", "kick", "x_moved", "delta"), vector)
+        self.known: dict[str, Any] = {
+            **self.around,
+            **self.density.constants,
+            **{"spacing": constants.spacing, "omega": constants.relaxation},
+            **self.layout.arrays(**vectors, T=symmetric(precision).kind),
+            **{"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK]},
+            "surfaced": self.density.surfaced,
+        }
+        """Arguments of kernels by name: surroundings, constants and the arrays of a step; T is y L of the present
+        iteration."""
         self.sides = None if system.sheets is None else Sides(system.sheets, constants.spacing, self.layout)
         """Keeps particles on their sides of sheets; None without sheets."""
-        self.following = following_kernels(*own) if follow else None
+        self.following = following_kernels(*own) if table.velocities_follow else None
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
-        self.bodies = Bodies(free[0], self.discretisation, self.layout) if free else None
-        dimension, spacing = system.walled.dimension, constants.spacing
-        self.coarse = Coarse(self.discretisation, self.layout, dimension, grid, spacing, self.bodies, endless)
+        self.bodies = Bodies(free[0], self.discretisation, self.around) if free else None
+        self.coarse = Coarse(system, grid, self.bodies, endless)
+        self.known["warm"] = self.coarse.warm
         self.corrected = [self._new_corrected()]
         """Iterates after the coarse correction, from which pressure iterations begin."""
         self.repair_relaxations = constants.repair_relaxations(repairs)
@@ -200,8 +204,7 @@ class ProjectionSteps(ParticleSolver):
         )
 
     def new_density(self) -> Surroundings:
-        own = self.discretisation, self.layout, self.topic, self.system.walled.dimension
-        return Surroundings(*own, self.constants, len(self.system.faces.solids))
+        return Surroundings(self.system, self.topic, self.constants)
 
     def kick_of(self, carried: Carried) -> wp.array:
         return carried[KICK]
@@ -211,8 +214,7 @@ class ProjectionSteps(ParticleSolver):
         return self.density.around
 
     def wall_push(self) -> ProjectionPush:
-        own = self.discretisation, self.layout, self.constants, self.lattice.volume
-        return ProjectionPush(*own, self.system.walled.dimension)
+        return ProjectionPush(self.system, self.constants)
 
     def image_loads(self) -> ImageLoads | None:
         mirrors = np.isfinite(self.system.mirrors).any() or len(self.system.faces.solids)
@@ -223,7 +225,6 @@ class ProjectionSteps(ParticleSolver):
         projection, repair = self.loops
         projection.run(lambda k: self.iterate(context, k, 0, 0))
         self.settle(context, 0)
-        self.move(context, 0)
         repair.run(lambda k: self.mend(context, k, 0, 0))
         v_end = self._finish(context, 0, 0, new_state)
         self.end_step(self.repaired[0]["x_now"], v_end, new_state, log)
@@ -246,7 +247,6 @@ class ProjectionSteps(ParticleSolver):
         for k in range(iterations):
             self.iterate(context, k, k, k + 1)
         self.settle(context, iterations)
-        self.move(context, iterations)
         for k in range(repairs):
             self.mend(context, k, k, k + 1)
 
@@ -258,8 +258,8 @@ class ProjectionSteps(ParticleSolver):
         return self._over_time(self.iterates[0]["k"], "push")
 
     def stresses(self) -> wp.array:
-        at = {"k": self.iterates[0]["k"], "T": self.pull}
-        return self._over_time(self.mean_stress.impulses(self.context(self.parameters), self.around, at), "stress")
+        context = self.context(self.parameters)
+        return self._over_time(self.mean_stress.impulses(context, self.iterates[0], self.known), "stress")
 
     def _over_time(self, impulses: wp.array, name: str) -> wp.array:
         pressed, found = pressed_kernels(self.layout.precision).forward, self._pressures[name]
@@ -272,8 +272,7 @@ class ProjectionSteps(ParticleSolver):
 
     @cached_property
     def mean_stress(self) -> MeanStress:
-        own = self.discretisation, self.layout, self.system.walled.dimension
-        return MeanStress(*own, len(self.system.faces.solids))
+        return MeanStress(self.system)
 
     @property
     def parameters(self) -> Parameters:
@@ -283,16 +282,13 @@ class ProjectionSteps(ParticleSolver):
     def predict(self, state: State, parameters: Parameters) -> StepContext:
         """Do all of a step before the pressure iterations: sort, add up explicit forces, predict v* = v + dt a, and
         write the first iterate."""
-        context, kernels, first = self.sort(state, parameters), self.kernels, self.iterates[0]
+        context = self.sort(state, parameters)
         if self.bodies is not None:
-            self.bodies.begin(context, self.around, self.carried[IMPULSE])
-        predicted = {"x_star": self.x_star, "v_star": self.v_star}
-        context.launch(self.integration.predict, acceleration=self.accelerate(context), **predicted)
-        before = {"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK], "v_star": self.v_star}
+            self.bodies.begin(context, self.carried[IMPULSE])
+        context.launch(self.integration.predict, self.known, acceleration=self.accelerate(context))
         self.coarse.warm.zero_()
-        flags = {"surfaced": self.density.surfaced, "warm": self.coarse.warm}
-        context.launch(kernels.beginning.forward, self.around, self.spaced, before, first, flags)
-        self.coarse.begin(context, self.around)
+        context.launch(self.kernels.beginning.forward, self.iterates[0], self.known)
+        self.coarse.begin(context, self.known)
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
@@ -300,17 +296,14 @@ class ProjectionSteps(ParticleSolver):
         old, at, new = self.iterates[before], self.corrected[before], self.iterates[after]
 
         def correct() -> None:
-            around = {**self.around, "drift": self._drift(context, old)}
-            self.coarse.correct(context, k, around, old, at, self.pull)
+            self.coarse.correct(context, k, {**self.known, "drift": self._drift(context, old)}, old, at)
 
         for name in ("k", "y", "u") if k == 0 or self.coarse.endless else ():  # where nothing corrects them
             wp.copy(at[name], old[name])
         self.coarse.where_due(k, correct)
-        out = {"k_out": new["k"], "y_out": new["y"], "T": self.pull, "error": self.loops[0].errors}
-        out["drift"] = self._drift(context, at)
-        update = self.kernels.pressure.update.forward
-        context.launch(update, out, self.around, at, self.relaxed, beta=self.momentum(k))
-        self.press(context, new)
+        out = {"k_out": new["k"], "y_out": new["y"], "error": self.loops[0].errors, "drift": self._drift(context, at)}
+        context.launch(self.kernels.pressure.update.forward, out, at, self.known, beta=self.momentum(k))
+        context.launch(self.kernels.velocity.velocity.forward, new, self.known)
 
     def momentum(self, k: int) -> float:
         return MOMENTUM if k == 0 else 0.0
@@ -320,45 +313,35 @@ class ProjectionSteps(ParticleSolver):
         drift = self.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
-    def press(self, context: StepContext, at: dict[str, wp.array]) -> None:
-        """Write u = v* - D^T y / m and the pull y L by the y of an iterate."""
-        own = {"y": at["y"], "u": at["u"], "T": self.pull, "kick": self.kick}
-        context.launch(self.kernels.velocity.velocity.forward, self.around, own, v_star=self.v_star)
-
     def settle(self, context: StepContext, last: int) -> None:
+        """Write the positions after moving by the new velocities and the shift."""
         if self.bodies is not None:
             self.bodies.settle(context, self.iterates[last]["y"])
-
-    def move(self, context: StepContext, last: int) -> None:
-        """Write the positions after moving by the new velocities and the shift."""
-        kernels, first = self.kernels, self.repaired[0]
-        flow = {"A": self.last_gradient(last), "k": self.iterates[last]["k"]}
-        context.launch(kernels.shift.forward, self.around, self.spaced, flow, delta=self.delta)
-        moved = {"v_new": self.iterates[last]["u"], "delta": self.delta, "x_moved": self.x_moved}
-        context.launch(kernels.moving.forward, moved)
-        wp.copy(first["x_now"], self.x_moved)
+        end, first = self.end_of(last), self.repaired[0]
+        context.launch(self.kernels.shift.forward, end, self.known)
+        context.launch(self.kernels.moving.forward, end, self.known)
+        wp.copy(first["x_now"], self.known["x_moved"])
         first["c"].zero_()
 
-    def last_gradient(self, slot: int) -> wp.array:
-        """Return A of the last iteration, given the slot with its result."""
-        return self.corrected[max(slot - 1, 0)]["A"]
+    def end_of(self, slot: int) -> dict[str, wp.array]:
+        """Return k, v and the A of the last iteration, given the slot with its result."""
+        end = self.iterates[slot]
+        return {"k": end["k"], "v_new": end["u"], "A": self.corrected[max(slot - 1, 0)]["A"]}
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
         """Do repair k, from the positions of slot ``before`` to those of slot ``after``."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
-        measured = {"x_now": at["x_now"], "c_in": at["c"], "c_out": new["c"], "excess": at["excess"]}
-        relaxed = {"omega": self.repair_relaxations[k], "error": self.loops[1].errors}
-        context.launch(kernels.measure.forward, self.around, measured, relaxed)
-        moved = {"c": new["c"], "x_moved": self.x_moved, "x_now": new["x_now"], "held": new["held"]}
-        context.launch(kernels.move.forward, self.around, self.spaced, moved)
+        measured = {"c_in": at["c"], "c_out": new["c"], "omega": self.repair_relaxations[k]}
+        context.launch(kernels.measure.forward, measured, at, self.known, error=self.loops[1].errors)
+        context.launch(kernels.move.forward, new, self.known)
 
     def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> wp.array:
         """Write the new state, and return its velocities, sorted."""
-        end, x_now = self.iterates[iterations], self.repaired[repairs]["x_now"]
-        v_end = end["u"]
+        end, last = self.end_of(iterations), self.repaired[repairs]
+        v_end = end["v_new"]
         if self.following is not None:
-            moved, v_end = {"x_now": x_now, "v_new": v_end, "v_end": self.delta}, self.delta  # which is moved by now
-            context.launch(self.following.forward, self.around, moved, A=self.last_gradient(iterations))
-        x_end = x_now if self.sides is None else self.sides.keep(context, x_now)
-        self.unsort(context, x_end, v_end, new_state, **{IMPULSE: end["k"], KICK: self.kick})
+            v_end = self.known["delta"]  # which is moved by now
+            context.launch(self.following.forward, end, last, self.known, v_end=v_end)
+        x_end = last["x_now"] if self.sides is None else self.sides.keep(context, last["x_now"])
+        self.unsort(context, x_end, v_end, new_state, **{IMPULSE: end["k"], KICK: self.known["kick"]})
         return v_end

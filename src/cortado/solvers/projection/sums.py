@@ -105,8 +105,7 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
         return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(q, g), cross_terms(q, g), g, crowd, push, near
 
     @tangent_of(moments)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def moments_tangent(
         x_ij, x_dot_ij, m_i, m_j, m_dot_i, m_dot_j, per_nearest, per_apart, s
     ) -> tuple[vector, vector, vector, vector, vector, vector, vector, real]:
@@ -129,24 +128,11 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
             near_dot,
         )
 
-    @fluid_sum(discretisation)
+    @fluid_sum(discretisation, typed)
     def moments_back(
-        x_ij: vector,
-        m_i: real,
-        m_j: real,
-        M_bar_i: six,
-        M_bar_j: six,
-        Q_bar_i: six,
-        Q_bar_j: six,
-        g_bar_ij: vector,
-        crowd_bar_ij: vector,
-        apart_bar_ij: vector,
-        n_bar_i: real,
-        n_bar_j: real,
-        per_nearest: real,
-        per_apart: real,
-        s: neighbourhood,
-    ) -> tuple[vector, real]:
+        x_ij, m_i, m_j, M_bar_i: six, M_bar_j: six, Q_bar_i: six, Q_bar_j: six, g_bar_ij, crowd_bar_ij, apart_bar_ij,
+        n_bar_i, n_bar_j, per_nearest, per_apart, s,
+    ) -> tuple[vector, real]:  # fmt: skip
         g = s.volume * gradient(x_ij, s)
         stretch = times(M_bar_i + M_bar_j, x_ij)
         from_i, from_j, per = times(Q_bar_i, g), times(Q_bar_j, g), mobility(m_j, m_i)
@@ -180,18 +166,12 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
         return v_ij[0] * g, v_ij[1] * g, v_ij[2] * g
 
     @tangent_of(velocity_gradient)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def velocity_gradient_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, s) -> tuple[vector, vector, vector]:
         g, g_dot = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, x_dot_ij, s)
-        return (
-            v_dot_ij[0] * g + v_ij[0] * g_dot,
-            v_dot_ij[1] * g + v_ij[1] * g_dot,
-            v_dot_ij[2] * g + v_ij[2] * g_dot,
-        )
+        return (v_dot_ij[0] * g + v_ij[0] * g_dot, v_dot_ij[1] * g + v_ij[1] * g_dot, v_dot_ij[2] * g + v_ij[2] * g_dot)
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def velocity_gradient_back(x_ij, v_ij, A_bar_i, A_bar_j, s) -> tuple[vector, vector]:
         pulled = wp.transpose(A_bar_i + A_bar_j) * v_ij
         return A_bar_j * (s.volume * gradient(x_ij, s)), s.volume * hessian_product(x_ij, pulled, s)
@@ -206,18 +186,14 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
         return ((c_i + c_j) * s.volume) * gradient(x_ij, s)
 
     @tangent_of(push)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def push_tangent(x_ij, x_dot_ij, c_i, c_j, c_dot_i, c_dot_j, s) -> vector:
         change = (c_dot_i + c_dot_j) * gradient(x_ij, s) + (c_i + c_j) * hessian_product(x_ij, x_dot_ij, s)
         return s.volume * change
 
     @fluid_sum(discretisation)
     def push_back(x_ij: vector, c_i: real, c_j: real, f_ij: vector, s: neighbourhood) -> tuple[real, vector]:
-        return (
-            s.volume * wp.dot(gradient(x_ij, s), f_ij),
-            ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s),
-        )
+        return (s.volume * wp.dot(gradient(x_ij, s), f_ij), ((c_i + c_j) * s.volume) * hessian_product(x_ij, f_ij, s))
 
     return SimpleNamespace(
         moments=Kernels(moments, moments_tangent, moments_back),
@@ -240,9 +216,9 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
     typed = types_by_name(precision)
+    both = [over(sums.force.forward, "total"), over(mirrors.lift.forward, "lifted")]
 
-    @particle_kernel(module, "kick u", [over(sums.force.forward, "total"), over(mirrors.lift.forward, "lifted")])
-    @typed
+    @particle_kernel(module, "kick u", both, typed=typed)
     def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
         """Return the kick -D^T y / m and u = v* + kick; T is y L."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
@@ -254,24 +230,11 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
     both = [over(sums.force.tangent, "total"), over(mirrors.lift.tangent, "lifted")]
 
-    @particle_kernel(tangent_module, "kick_dot u_dot", both)
+    @particle_kernel(tangent_module, "kick_dot u_dot", both, typed=typed)
     def velocity_tangent(
-        total: vector,
-        lifted: vector,
-        m_i: real,
-        m_dot_i: real,
-        y_i: real,
-        y_dot_i: real,
-        T_i: six,
-        T_dot_i: six,
-        g_i: vector,
-        g_dot_i: vector,
-        gamma_i: vector,
-        gamma_dot_i: vector,
-        v_star_i: vector,
-        v_star_dot_i: vector,
-        u_i: vector,
-    ) -> tuple[vector, vector]:
+        total, lifted, m_i, m_dot_i, y_i, y_dot_i, T_i, T_dot_i, g_i, g_dot_i, gamma_i, gamma_dot_i, v_star_i,
+        v_star_dot_i, u_i,
+    ) -> tuple[vector, vector]:  # fmt: skip
         change = total + lifted + times(T_dot_i, g_i) + times(T_i, g_dot_i)
         change += y_dot_i * gamma_i + y_i * gamma_dot_i
         kick_dot = -(change + m_dot_i * (u_i - v_star_i)) / m_i
@@ -279,8 +242,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
     both = [over(sums.force.adjoint, "diagonal others x_part"), over(mirrors.lift.adjoint, "widened x_lift")]
 
-    @particle_kernel(adjoint_module, "+y_bar +image_bar +L_bar +gamma_bar +x_bar", both)
-    @typed
+    @particle_kernel(adjoint_module, "+y_bar +image_bar +L_bar +gamma_bar +x_bar", both, typed=typed)
     def velocity_adjoint(
         diagonal, others, x_part, widened, x_lift, y_i, L_i, gamma_i, image_i, f_i
     ) -> tuple[real, real, matrix, vector, vector]:
@@ -288,8 +250,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
         y_part = wp.ddot(L_i, A) + wp.dot(gamma_i, f_i) + image_i * widened
         return y_part, y_i * widened, y_i * A, y_i * f_i, x_part + x_lift
 
-    @particle_kernel(adjoint_module, "+v_bar +m_bar T f kick_bar")
-    @typed
+    @particle_kernel(adjoint_module, "+v_bar +m_bar T f kick_bar", typed=typed)
     def own_adjoint(m_i, v_star_i, y_i, L_i, u_i, u_bar_i, kick_bar_i) -> tuple[vector, real, six, vector, vector]:
         """Write f = -(u_bar + kick_bar) / m and T = y L; the adjoint of the kick is 0 afterwards."""
         bar = u_bar_i + kick_bar_i

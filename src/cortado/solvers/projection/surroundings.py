@@ -10,18 +10,12 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
-from cortado.particles.state import Layout
 from cortado.particles.wall_terms import solid_kernel
+from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.projection.effects import effect_functions, image_share, image_sums
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.solvers.projection.sums import APART, projection_sums
-from cortado.solvers.projection.wall_sums import (
-    FaceShares,
-    beside_sums,
-    beside_term,
-    edge_functions,
-    weights_type,
-)
+from cortado.solvers.projection.wall_sums import FaceShares, beside_sums, beside_term, edge_functions, weights_type
 from cortado.sph.density import Density, DensityAdjoint, DensityTangent
 from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -76,8 +70,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     typed = TypesByName(real, {neighbourhood: "s", vector: "x v", around: "of dot", bars: "bar", six: "M Q"})
 
-    @wp.kernel(module=module)
-    @typed.arrays
+    @typed.kernel(module)
     def surroundings(s, least: real, per_nearest: real, per_apart: real, x, v, m, n, of, surfaced: wp.array(dtype=int)):
         """Write surroundings; set ``surfaced`` to 1 in scenes with a free surface."""
         i = s.first + wp.tid() // LANES
@@ -121,8 +114,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         if not (shared > real(0.0)) and surfaced[i // s.particles] == 0:
             surfaced[i // s.particles] = 1
 
-    @wp.kernel(module=tangent_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(tangent_module)
     def surroundings_tangent(
         s, least: real, per_nearest: real, per_apart: real, x, x_dot, v, v_dot, m, m_dot, of, n_dot, dot
     ):
@@ -195,8 +187,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         dot.weights[i] = weights_dot
         dot.coarse[i] = coarse_dot
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(adjoint_module)
     def own_adjoint(least: real, m, n_bar, of, m_bar, bar, M_pull, Q_pull):
         """Add to the adjoints of the moments, given the adjoints of the quantities computed from moments."""
         i = wp.tid()
@@ -236,8 +227,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
         bar.normal_drift[i] = (real(1.0) - e) * drift_bar
         bar.whole_drift[i] = e * drift_bar
 
-    @wp.kernel(module=adjoint_module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(adjoint_module)
     def sums_adjoint(s, per_nearest: real, per_apart: real, x, v, m, n_bar, M_pull, Q_pull, bar, x_bar, m_bar):
         i = s.first + wp.tid() // LANES
         x_part, m_part = moments_back(
@@ -258,17 +248,10 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 class Surroundings(Density):
     """The measurement of the number density n and of all surroundings."""
 
-    def __init__(
-        self,
-        discretisation: Discretisation,
-        layout: Layout,
-        topic: str,
-        dimension: int,
-        constants: ProjectionConstants,
-        faces: int,
-    ):
-        super().__init__(discretisation, topic, surrounding_kernels(discretisation, dimension))
-        self.layout, self.faces = layout, faces
+    def __init__(self, system: ParticleSystem, topic: str, constants: ProjectionConstants):
+        kernels = surrounding_kernels(system.discretisation, system.walled.dimension)
+        super().__init__(system.discretisation, topic, kernels)
+        self.system, layout = system, system.layout
         self.around = layout.arrays(**entries(layout.precision))
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
@@ -291,7 +274,8 @@ class SurroundingsTangent(DensityTangent):
 
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
-        self.around = surroundings.layout.arrays("_dot", **entries(surroundings.layout.precision))
+        layout = surroundings.system.layout
+        self.around = layout.arrays("_dot", **entries(layout.precision))
 
     def measure(self, context: StepContext, dot: Tangents) -> None:
         own = self._density
@@ -303,11 +287,10 @@ class SurroundingsAdjoint(DensityAdjoint):
 
     def __init__(self, surroundings: Surroundings):
         super().__init__(surroundings)
-        precision = surroundings.layout.precision
-        self.around = surroundings.layout.arrays("_bar", **bar_entries(precision))
-        self._faces = FaceShares(surroundings.discretisation, surroundings.layout, surroundings.faces)
-        six = symmetric(precision).kind
-        self._moments = surroundings.layout.arrays("_pull", M=six, Q=six)
+        layout, precision = surroundings.system.layout, surroundings.system.layout.precision
+        self.around = layout.arrays("_bar", **bar_entries(precision))
+        self._faces = FaceShares(surroundings.system)
+        self._moments = layout.arrays("_pull", M=precision.six, Q=precision.six)
 
     def begin(self) -> None:
         for array in self.around.values():

@@ -45,8 +45,8 @@ from cortado.particles.moving_walls import turn_functions
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
 from cortado.particles.pair_sums import wall_sum
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.particles.state import Layout
 from cortado.particles.wall_terms import ALL_WALLS, WallTerm, share_kinds
+from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.projection.lattice import ProjectionConstants
 from cortado.sph.density import WallSums, wall_slope_term
 from cortado.sph.moment_functions import moment_functions, symmetric
@@ -105,8 +105,7 @@ def beside_sums(discretisation: Discretisation) -> Kernels:
         part = normal(whole, foot)
         return part, whole, s.volume * weight(x_ij, s), wp.dot(part, v_j), wp.dot(whole, v_j)
 
-    @wall_sum(discretisation, grows=beside)
-    @typed
+    @wall_sum(discretisation, typed, grows=beside)
     def beside_tangent(x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, s) -> tuple[vector, vector, real, real, real]:
         """Return the tangent of a wall particle's terms: a turning wall turns its push, and ``rest`` is the remaining
         motion."""
@@ -117,8 +116,7 @@ def beside_sums(discretisation: Discretisation) -> Kernels:
         part_drift, whole_drift = wp.dot(part_dot, v_j) + wp.dot(part, v_dot_j), wp.dot(whole_dot, v_j)
         return part_dot, whole_dot, wp.dot(whole, rest), part_drift, whole_drift + wp.dot(whole, v_dot_j)
 
-    @wall_sum(discretisation)
-    @typed
+    @wall_sum(discretisation, typed)
     def beside_back(
         x_ij, v_j, normal_bar_i, whole_bar_i, nu_bar_i, normal_drift_bar_i: real, whole_drift_bar_i: real, foot, s
     ) -> vector:
@@ -139,24 +137,14 @@ def _normal_work(d: Discretisation) -> Any:
 
 def beside_term(d: Discretisation) -> Any:
     """Make the work function by which adjoints of the sums over walls act on solids."""
-    real, vector, pair = d.precision.real, d.precision.vector, pair_functions(d)
-    weight, gradient, normal = pair.weight, pair.gradient, normal_part(d)
+    real, pair, normal = d.precision.real, pair_functions(d), normal_part(d)
+    weight, gradient = pair.weight, pair.gradient
 
+    @types_by_name(d.precision)
     def beside_work(
-        x_ij: vector,
-        v_j: vector,
-        normal_bar_i: vector,
-        whole_bar_i: vector,
-        nu_bar_i: real,
-        normal_drift_bar_i: real,
-        whole_drift_bar_i: real,
-        mirror_bar_i: vector,
-        behind_bar_i: real,
-        sweep_bar_i: real,
-        mirrored: real,
-        foot: vector,
-        s: neighbourhood_type(d.precision),
-    ) -> real:
+        x_ij, v_j, normal_bar_i, whole_bar_i, nu_bar_i, normal_drift_bar_i: real, whole_drift_bar_i: real, mirror_bar_i,
+        behind_bar_i, sweep_bar_i, mirrored, foot, s,
+    ) -> real:  # fmt: skip
         """Return the work of these sums, also over mirroring walls, whose drift has the adjoint -``sweep_bar``."""
         whole, by_mirror = gradient(x_ij, s), mirrored * (mirror_bar_i - sweep_bar_i * v_j)
         part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j + by_mirror)
@@ -189,20 +177,14 @@ def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 class ProjectionPush:
     """Sums along which pressures push walls: a `cortado.sph.density.WallAction`."""
 
-    def __init__(
-        self,
-        discretisation: Discretisation,
-        layout: Layout,
-        constants: ProjectionConstants,
-        volume: float,
-        dimension: int,
-    ):
-        self._kernels, self._layout = push_kernels(discretisation, dimension), layout
+    def __init__(self, system: ParticleSystem, constants: ProjectionConstants):
+        discretisation, layout = system.discretisation, system.layout
+        self._kernels, self._layout = push_kernels(discretisation, system.walled.dimension), layout
         normal_term = WallTerm(discretisation, "projection", _normal_work, "push_bar")
         terms = {"normal": normal_term, "whole": wall_slope_term(discretisation)}
         self._sums = {name: WallSums(term, layout) for name, term in terms.items()}
         self._all_sums = {f"all_{name}": WallSums(term, layout) for name, term in terms.items()}
-        self._least = {"least": constants.least_diagonal / volume**2}
+        self._least = {"least": constants.least_diagonal / system.lattice.volume**2}
 
     def total(self, step: StepContext, solid: int) -> wp.array:
         found = self._arrays["push"]
@@ -345,10 +327,11 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
 class FaceShares:
     """The particles' contributions, through images, to the adjoints of solids."""
 
-    def __init__(self, discretisation: Discretisation, layout: Layout, faces: int):
-        self._kernel, self._faces = partial(face_share_kernel, discretisation), faces
-        own = {"u": layout.precision.vector, "slope": layout.precision.matrix}
-        self._nothing = layout.arrays(**own, **dict.fromkeys(NUMBERS, layout.precision.real)) if faces else {}
+    def __init__(self, system: ParticleSystem):
+        self._kernel, self._faces = partial(face_share_kernel, system.discretisation), len(system.faces.solids)
+        precision = system.layout.precision
+        kinds = {"u": precision.vector, "slope": precision.matrix, **dict.fromkeys(NUMBERS, precision.real)}
+        self._nothing = system.layout.arrays(**kinds) if self._faces else {}
 
     def add(
         self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: wp.array
