@@ -82,8 +82,7 @@ class TypesByName:
 
         typed = TypesByName(real, {vector: "x v", neighbourhood: "s"})
 
-        @fluid_sum(discretisation)
-        @typed
+        @fluid_sum(discretisation, typed)
         def spread(x_ij, x_dot_ij, v_ij, m_i, m_j, s) -> vector: ...
 
     A parameter without annotation gets the type of the longest listed name that begins its name, as x begins x_dot_ij.

@@ -27,6 +27,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from re import sub
+from types import MappingProxyType
 from typing import Any
 
 import warp as wp
@@ -241,7 +242,7 @@ def pointwise_kernels(
     modules: Sequence[Any],
     make: Callable[[Any], Callable[..., Any]],
     results: Sequence[str],
-    replaced: Mapping[str, str] | None = None,
+    replaced: Mapping[str, str] = MappingProxyType({}),
     **names: Any,
 ) -> Kernels:
     """Make forward, tangent and adjoint kernels, in the three Warp ``modules``, of the function that ``make(module)``
@@ -254,7 +255,7 @@ def pointwise_kernels(
     """
     functions = [make(module) for module in modules]
     terms = [Term.of(function) for function in functions]
-    of = _Pointwise(precision, terms[0], results, replaced or {}, Kinds(**names), modules[0].options["enable_backward"])
+    of = _Pointwise(precision, terms[0], results, Kinds(replaced, **names), modules[0].options["enable_backward"])
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())
     made = []
     for k, ((name, types, lines), term, module) in enumerate(zip(texts, terms, modules, strict=True)):
@@ -269,6 +270,7 @@ def pointwise_kernels(
 class Kinds:
     """Roles of parameters and results in pointwise kernels; all groups are optional."""
 
+    replaced: Mapping[str, str]
     numbers: Collection[str] = ()
     """Parameters that are numbers of a launch, without derivatives."""
     written: Collection[str] = ()
@@ -288,20 +290,12 @@ class Kinds:
 
 
 class _Pointwise:
-    def __init__(
-        self,
-        precision: Precision,
-        term: Term,
-        results: Sequence[str],
-        replaced: Mapping[str, str],
-        kinds: Kinds,
-        taped: bool,
-    ):
-        self._term, self._precision, self._kinds, self._replaced, self._taped = term, precision, kinds, replaced, taped
+    def __init__(self, precision: Precision, term: Term, results: Sequence[str], kinds: Kinds, taped: bool):
+        self._term, self._precision, self._kinds, self._taped = term, precision, kinds, taped
         self._before = dict(one.split(":") for one in results if ":" in one)
         names = (one.partition(":")[0] for one in results)
         self._results = dict(zip(names, term.results, strict=True))
-        self._overwritten = {*replaced.values(), *kinds.written}
+        self._overwritten = {*kinds.replaced.values(), *kinds.written}
         self._entries, self._indices, self._inputs = {}, {}, {}
         self._numbers: dict[str, Any] = {}
         self._arrays = {kinds.where: precision.real} if kinds.where else {}
@@ -358,7 +352,7 @@ class _Pointwise:
         return f"{self._term.name}_tangent", *self._kernel(written, self._changes("dot"), lines)
 
     def adjoint(self) -> tuple[str, Types, Iterable[str]]:
-        turned, held, summed, bars, left = self._kinds.turned, self._replaced, self._kinds.summed, [], {}
+        turned, held, summed, bars, left = self._kinds.turned, self._kinds.replaced, self._kinds.summed, [], {}
         for n, (result, kind) in enumerate(self._results.items()):
             bar = self._changed(held[result], "bar") if result in held else f"{turned.get(result, result)}_bar[i]"
             if result in summed:

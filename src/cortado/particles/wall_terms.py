@@ -201,12 +201,11 @@ class SolidShares:
 
     def __init__(self, walls: MovingWalls | None, layout: Layout):
         self._walls, self._pair = walls, layout.precision.pair
-        size, kinds, device = layout.all_particles, share_kinds(layout.precision), layout.device
-        solids = range(0 if walls is None else walls.solids)
-        self._arrays = [{name: wp.zeros(size, dtype=kinds[name], device=device) for name in NAMES} for _ in solids]
-        self._sums = [{name: layout.sum_of(kinds[name]) for name in NAMES} for _ in solids]
-        whole = {name: (layout.members, kinds[name]) for name in NAMES}
-        self._whole = [zeros(whole, device) for _ in solids]
+        kinds, solids = share_kinds(layout.precision), range(0 if walls is None else walls.solids)
+        self._arrays = [layout.arrays("_bar", **kinds) for _ in solids]
+        self._sums = [[layout.sum_of(kind) for kind in kinds.values()] for _ in solids]
+        whole = {bar: (layout.members, kind) for bar, kind in zip(BARS, kinds.values(), strict=True)}
+        self._whole = [zeros(whole, layout.device) for _ in solids]
 
     def add(
         self,
@@ -228,20 +227,21 @@ class SolidShares:
                 launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
 
     def of(self, solid: int) -> dict[str, wp.array]:
-        return {f"{name}_bar": array for name, array in self._arrays[solid].items()}
+        return self._arrays[solid]
 
     def collect(self, solid: int) -> dict[str, wp.array]:
         """Return the sums (members,) of a solid's terms, adjoints of poses and scale, and set the terms to 0."""
-        found = {name: total(self._arrays[solid][name]) for name, total in self._sums[solid].items()}
-        for name, given in self._whole[solid].items():
-            add(given, found[name])
+        sums = zip(self._sums[solid], self._arrays[solid].values(), strict=True)
+        found = dict(zip(BARS, (total(array) for total, array in sums), strict=True))
+        for bar, given in self._whole[solid].items():
+            add(given, found[bar])
         self._forget(solid)
-        return dict(zip(BARS, found.values(), strict=True))
+        return found
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
         """Add values (members,) that do not come from particles to adjoints `BARS` of a solid, by name."""
         for bar, one in given.items():
-            add(one, self._whole[solid][NAMES[BARS.index(bar)]])
+            add(one, self._whole[solid][bar])
 
     def clear(self) -> None:
         for solid in range(len(self._arrays)):

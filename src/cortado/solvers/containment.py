@@ -51,7 +51,8 @@ def solids_type(precision: Precision) -> Any:
 @cache
 def lost_kernel(precision: Precision) -> Any:
     real, vector = precision.real, precision.vector
-    bounds_struct, solids_struct, matrix = bounds_type(precision), solids_type(precision), precision.matrix
+    bounds_struct, solids_struct, poses = bounds_type(precision), solids_type(precision), wp.array2d(dtype=vector)
+    turnings = wp.array2d(dtype=precision.matrix)
     module = kernel_module(f"containment_{precision.name}")
 
     @wp.func
@@ -83,14 +84,7 @@ def lost_kernel(precision: Precision) -> Any:
         return scale
 
     @wp.func
-    def seen_from(
-        x: vector,
-        k: int,
-        member: int,
-        positions: wp.array2d(dtype=vector),
-        turns: wp.array2d(dtype=matrix),
-        solids: solids_struct,
-    ) -> vector:
+    def seen_from(x: vector, k: int, member: int, positions: poses, turns: turnings, solids: solids_struct) -> vector:
         """Return x in the frame of the mesh of solid k, as nearest periodic image."""
         if k < solids.still:
             return nearest_image(x - solids.middles[k], solids)

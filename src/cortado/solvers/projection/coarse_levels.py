@@ -36,7 +36,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
     AROUND, CORNERS, among = wp.constant(3**dimension), wp.constant(2**dimension), node_functions(dimension)
     PAIRS, row = wp.constant(pairs_of_corners(dimension)), wp.types.vector(length=2**dimension, dtype=real)
     number_of, node_of, step_of = among.number_of, among.node_of, among.step_of
-    corner_step, pair_of = among.corner_step, among.pair_of
+    corner_step, pair_of, terms = among.corner_step, among.pair_of, wp.array2d(dtype=real)
 
     @wp.struct
     class Place:
@@ -88,14 +88,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
         return real(0.125) * real(8 >> ((bits & 1) + ((bits >> 1) & 1) + ((bits >> 2) & 1)))
 
     @wp.kernel(module=module, enable_backward=False)
-    def coarsen(
-        fine: wp.vec3i,
-        shape: wp.vec3i,
-        factor: wp.vec3i,
-        cells_fine: wp.array2d(dtype=real),
-        # out
-        cells: wp.array2d(dtype=real),
-    ):
+    def coarsen(fine: wp.vec3i, shape: wp.vec3i, factor: wp.vec3i, cells_fine: terms, cells: terms):
         """Sum P^T M P over the matrices M of a coarse cell's children, with a thread for each corner of each cell."""
         a = wp.tid() // cells.shape[1]
         cell = wp.tid() - a * cells.shape[1]

@@ -265,13 +265,7 @@ def solve_kernel(precision: Precision, dimension: int, is_cpu: bool) -> Any:
     bounds = None if is_cpu else (BLOCK, 1)  # so that registers suffice for a block; 3 to 9 % less time for a solve
 
     @wp.kernel(module=module, enable_backward=False, grid_stride=False, launch_bounds=bounds)
-    def solve(
-        system: system_kind,
-        tolerance: real,
-        most: int,
-        # out
-        e: wp.array(dtype=real),
-    ):
+    def solve(system: system_kind, tolerance: real, most: int, e: wp.array(dtype=real)):
         solve_all(wp.tid(), system, tolerance, most, e)
 
     if not is_cpu:

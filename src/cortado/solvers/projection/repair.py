@@ -114,10 +114,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     both = [over(push, "pushed"), over(lift, "lifted", y="c")]
 
-    @particle_kernel(module, "held x_now", both, numbers=["spacing"])
-    def move(
-        pushed: vector, lifted: vector, spacing: real, m_i: real, gamma_i: vector, c_i: real, x_moved_i: vector
-    ) -> tuple[real, vector]:
+    @particle_kernel(module, "held x_now", both, numbers=["spacing"], typed=typed)
+    def move(pushed, lifted, spacing, m_i, gamma_i, c_i, x_moved_i) -> tuple[real, vector]:
         """Move a particle by lambda' within the bound; ``held`` is the part of the full displacement."""
         back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
@@ -135,10 +133,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
         back = (x_moved_i - x_now_i) / held_i
         return x_moved_dot_i - along((change - m_dot_i * back) / m_i, back, held_i)
 
-    @particle_kernel(adjoint_module, "+m_bar +x_moved_bar f")
-    def begin_adjoint(
-        m_i: real, x_now_i: vector, x_moved_i: vector, held_i: real, x_now_bar_i: vector
-    ) -> tuple[real, vector, vector]:
+    @particle_kernel(adjoint_module, "+m_bar +x_moved_bar f", typed=typed)
+    def begin_adjoint(m_i, x_now_i, x_moved_i, held_i, x_now_bar_i) -> tuple[real, vector, vector]:
         """Apply the adjoint of the particle's terms in x_k+1; f is the adjoint of the sum over neighbours."""
         back = (x_moved_i - x_now_i) / held_i
         bar = along(x_now_bar_i, back, held_i)

@@ -301,14 +301,7 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
         return force, torque, before, turned, growth, x_part, per * total
 
     @wp.kernel(module=module, enable_backward=False)
-    def face_share(
-        s: neighbourhood,
-        solid: int,
-        time_step: wp.array(dtype=real),
-        at: seen,
-        # in and out
-        bar: bars,
-    ):
+    def face_share(s: neighbourhood, solid: int, time_step: wp.array(dtype=real), at: seen, bar: bars):
         i = s.first + wp.tid()
         if s.all_count[i] > s.count[i]:
             per = real(1.0) / time_step[i // s.particles]
