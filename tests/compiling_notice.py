@@ -15,9 +15,8 @@ Without functions of bfloat16 a module takes 0.05 s less, and its first in a pro
 
 def compile_fast(flags):
     """Kernels are compiled with these flags, and as they are written, in a third of the time, if they run for next to
-    nothing: derivatives of modules that are named after no smoothing kernel, so without sums over neighbours, those
-    that Warp makes for a tape, and those in a period, which few tests take. Implicit solves run their derivatives
-    forward too, many times a step."""
+    nothing: derivatives of modules that are named after no smoothing kernel, so without sums over neighbours, and those
+    that Warp makes for a tape. Bodies look for their contacts by all their points in every step."""
     import re
 
     import warp as wp
@@ -26,7 +25,7 @@ def compile_fast(flags):
 
     def unoptimised(name):
         module = get_module(name)
-        if "implicit" not in name and re.search(r"_taped|_(derivative|tangent)((_\d+)?_float\d+$|_.*_periodic)", name):
+        if "contacts" not in name and re.search(r"_taped|_(derivative|tangent)(_\d+)?_float\d+$", name):
             module.options["optimization_level"] = 0
         return module
 

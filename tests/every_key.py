@@ -4,6 +4,7 @@ import inspect
 import json
 import warnings
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,6 +16,7 @@ from cortado.scene.tables import Table
 
 LATER = ("times", "rotations", "extinction_schedule")
 """Lists whose first entry has to be what it is."""
+json_schema = cache(lambda table: table.model_json_schema())
 Key = tuple[str, str]
 """The name of the table that declares a key, and the key."""
 
@@ -77,7 +79,7 @@ def put(data: Any, path: tuple, made: Table) -> None:
     for part in path[:-1]:
         there = there[part] if isinstance(part, int) else getattr(there, part)
         table = table[part] if isinstance(part, int) or part in table else table.setdefault(part, {})
-    schema = type(there).model_json_schema()["properties"][name]
+    schema = json_schema(type(there))["properties"][name]
     value = table[name] if name in table else there.model_dump()[name]
     table[name] = changed(value, schema, -1 if name in LATER else 0)
 

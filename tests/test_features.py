@@ -317,6 +317,7 @@ def test_it_is_certified(name):
     ("name", "words"),
     [
         ("projection, plane", 'solver.kind "projection" has no '),
+        ("a body", 'solver.kind "projection" has no '),
         ("implicit viscosity, no slip", r"implicit viscosity has no tape: try gradients\.Exact"),
         ("beside a rotor, PCISPH", r"solids that move have no tape: try gradients\.Exact"),
     ],

@@ -7,9 +7,7 @@ from pydantic import TypeAdapter
 
 from cortado import InputError, Problem, Scene, SceneError, Simulation, Trajectory
 from cortado.discretise.solid import Mass
-from cortado.errors import MissingDerivativeError
-from cortado.gradients import Tape
-from cortado.losses import CentreOfMass, SolidPose
+from cortado.losses import SolidPose
 from cortado.runs.frames import posed
 from cortado.scene.solid_shapes import AnySolid
 from cortado.solvers.contacts import STIFFNESS
@@ -330,12 +328,6 @@ def test_what_a_body_cannot_be_is_a_sentence(changes, tables, sentence):
 def test_bodies_do_not_begin_in_each_other():
     with pytest.raises(SceneError, match=r"solid\[0\] is .* m deep in the solid 'other' at"):
         plane(RAFT, {**RAFT, "name": "other", "rotation": 0.3})
-
-
-def test_what_has_no_derivative_beside_bodies_says_so():
-    problem = Problem(Simulation(plane(RAFT)), 3, CentreOfMass([0.5, 0.3]))
-    with pytest.raises(MissingDerivativeError):
-        problem.value_and_gradient({"gravity": [0.0, -9.81]}, gradient=Tape())
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import math
 import re
 import tomllib
 import warnings
-from functools import cache
 from unicodedata import normalize
 
 import numpy as np
@@ -27,6 +26,7 @@ from cortado.scene.fluid_particles import fluid_particles
 from cortado.scene.model import MixtureTable
 from cortado.scene.scene import Scene, scene_from_dict
 from cortado.scene.tables import Table
+from every_key import json_schema
 from scenes import box, plane, plane_of_three, scene
 
 
@@ -36,8 +36,6 @@ def _tables(table: type[Table] = Table) -> list[type[Table]]:
 
 TABLES = [table for table in _tables() if table.model_fields]
 FIELDS = [pytest.param(table, name, id=f"{table.__name__}.{name}") for table in TABLES for name in table.model_fields]
-
-json_schema = cache(lambda table: table.model_json_schema())
 
 
 def schema_of(table: type[Table], name: str) -> dict:
