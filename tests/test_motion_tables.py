@@ -157,12 +157,13 @@ def test_a_file_that_cannot_be_used_is_a_sentence(tmp_path, text):
     )
 
 
-def test_marks_of_order_and_ends_of_lines_of_other_systems_are_read_and_files_too_large_are_not(tmp_path, monkeypatch):
+def test_marks_of_order_and_ends_of_lines_of_other_systems_are_read_and_files_too_large_are_not(tmp_path):
     (tmp_path / "p.csv").write_bytes(b"\xef\xbb\xbftime [s],x [mm]\r\n0,0\r\n\r\n1,5\r\n")
     assert courses(paddle(path=str(tmp_path / "p.csv")).solid[0])[0].values[-1].tolist() == [0.005, 0.0]
-    monkeypatch.setattr(tables, "MOST_BYTES", 20)
+    with open(tmp_path / "large.csv", "wb") as large:
+        large.truncate(tables.MOST_BYTES + 1)
     for file, words in (
-        ("p.csv", "it has 32 bytes, but must have at most 20"),
+        ("large.csv", "it has 33,554,433 bytes, but must have at most 33,554,432"),
         ("none.csv", "No such file"),
         ("", "a dir"),
     ):

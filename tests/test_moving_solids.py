@@ -237,7 +237,7 @@ def test_a_path_bounds_all_steps_where_nothing_else_does():
 
 def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
     """With walls that weigh nothing; a larger one comes to it sooner, by what it reaches further down."""
-    from cortado.scene import discrete_scene as walls
+    from cortado.discretise import walls
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
     falling = box([0.2, 0.45], [0.4, 0.65], name="block", motion="path", velocity=[0.0, -1.0])

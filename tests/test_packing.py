@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 import cortado
 from cortado import Scene, SceneError, Simulation
-from cortado.discretise.packing import Linearised, PointsAround, Relaxation
+from cortado.discretise.packing import PointsAround, Relaxation
 from cortado.discretise.room import Region
 from cortado.discretise.shapes import pairs_within
 from cortado.discretise.smoothing import CUBIC_SPLINE
@@ -205,10 +205,12 @@ def test_derivatives_of_densities_and_distances(dimension):
     points, free = generator.uniform(size=(300, dimension)), np.arange(100) % 3 > 0
     blind, lengths = np.arange(100) % 2 == 0, np.array([0.0, 1.0, 0.0])[:dimension]
 
-    def linearised(moves: np.ndarray | float = 0.0) -> Linearised:
+    def linearised(moves: np.ndarray | float = 0.0) -> Relaxation:
         moved = points.copy()
         moved[:100] += moves
-        return Relaxation(around(moved, (100, 200), lengths, 0.25), blind, free).linearised(0.09)
+        made = Relaxation(around(moved, (100, 200), lengths, 0.25), blind, free)
+        made.linearise(0.09)
+        return made
 
     moves = free[:, None] * generator.normal(size=(100, dimension))
     found, step = linearised(), 1e-6

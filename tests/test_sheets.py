@@ -1,5 +1,6 @@
 """Sheets, walls of no thickness: what they hide, that they hold water and let nothing through, and derivatives."""
 
+import os
 from itertools import pairwise
 
 import numpy as np
@@ -388,3 +389,14 @@ def test_free_bodies_beside_sheets_and_corners_off_a_plane_are_sentences(tmp_pat
         space(solid=[{**FLAP, "corners": FLAP["corners"][:2]}])
     with pytest.raises(SceneError, match=r"file cannot be used: .*nothing\.stl' cannot be opened"):
         space(solid=[{**FLAP, "corners": None, "file": "nothing.stl"}])
+
+
+@pytest.mark.parametrize("shape", ["sheet", "mesh"])
+def test_a_file_that_was_replaced_is_read_again(tmp_path, shape):
+    file = tmp_path / "part.stl"
+    for upper in (0.5, 0.6):
+        trimesh.creation.box(bounds=[[0.3] * 3, [upper] * 3]).export(file)
+        os.utime(file, (upper, upper))
+        table = space(solid=[{"name": "part", "shape": shape, "file": str(file)}])
+        found = table.room.solids[0] if shape == "mesh" else table.solid[0].solid()
+        np.testing.assert_allclose(found.extent()[1], upper, rtol=1e-6)

@@ -196,7 +196,7 @@ def test_a_cup_that_leans_holds_water():
 
 def test_what_enters_a_solid_is_lost_and_said(monkeypatch):
     """With walls that weigh nothing."""
-    from cortado.scene import discrete_scene as walls
+    from cortado.discretise import walls
 
     monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
     above = {"shape": "box", "lower": [0.5, 0.4], "upper": [0.7, 0.6], "phase": "water"}

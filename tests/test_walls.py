@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from cortado import InputError, Scene, SceneError, Simulation
+from cortado.discretise.primitives import cut_box_faces
 from cortado.discretise.smoothing import KERNELS, SLACK
-from cortado.discretise.solid import cut_box_faces
 from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box, wall_layers
 from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.discrete_scene import DiscreteScene, discretise

@@ -97,7 +97,7 @@ def _row(key: str, field: Schema, needed: bool, link: tuple[str, str] | None) ->
     between = _range(number)
     measure = (f" [{unit}]" if unit else "") + (f", {between}" if between else "")
     own = _kind(value)
-    if own.startswith("d ") and re.search("in 2-D one\\s+number", field.get("description", ""), re.IGNORECASE):
+    if "maxItemsIn2D" in value:
         own = f"{'3 or 9' if value['maxItems'] == 9 else '3'} numbers, in 2-D one"
     kinds = (", or " if between else " or ").join([f"{own}{measure}", *(f'`"{word}"`' for word in words)])
     return f"`{key}`", kinds, _default(field, needed), _meaning(key, field, unit)

@@ -86,9 +86,12 @@ def place_in_file(place: Points) -> str:
 def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
     """Return vertices (m, 3) and triangles (k, 3), with vertices merged that are equal or closer than ``tolerance``,
     without triangles that repeat a vertex, duplicates, and pairs back to back."""
+    from scipy.spatial import cKDTree
+
     vertices, names = _distinct(vertices)
     if tolerance > 0.0:
-        vertices, names = _further_apart(vertices, names, tolerance)
+        groups = _connected(cKDTree(vertices).query_pairs(tolerance, output_type="ndarray"), len(vertices))
+        vertices, names = vertices[np.unique(groups, return_index=True)[1]], groups[names]
     triangles = names[triangles]
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     turned = np.take_along_axis(triangles, (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
@@ -106,20 +109,11 @@ def _distinct(vertices: Points) -> tuple[Points, Numbers]:
     return vertices[order[new]], names
 
 
-def _further_apart(vertices: Points, names: Numbers, tolerance: float) -> tuple[Points, Numbers]:
-    from scipy.spatial import cKDTree
-
-    groups = _connected(cKDTree(vertices).query_pairs(tolerance, output_type="ndarray"), len(vertices))
-    return vertices[np.unique(groups, return_index=True)[1]], groups[names]
-
-
 def _connected(links: Numbers, count: int) -> Numbers:
     """Return the connected component (count,) of each node; ``links`` (m, 2) are pairs of nodes."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    from trimesh.graph import connected_component_labels
 
-    graph = coo_array((np.ones(len(links), dtype=np.int8), tuple(links.T)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    return np.asarray(connected_component_labels(links, count), dtype=np.int64)
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:

@@ -1,11 +1,9 @@
 """Solids from files of triangles, read by trimesh, with checks of their unit of length and thickness."""
 
-import os
 import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ from cortado.discretise.mesh import Mesh
 from cortado.discretise.mesh_checks import FoundMesh, found_mesh
 from cortado.discretise.shapes import Numbers, Points, bisected
 from cortado.errors import InputError, Words, shown, warn
-from cortado.files.disk import reason, regular_file
+from cortado.files.disk import cached_by_file, reason
 
 SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
 MOST_BYTES = 2**30
@@ -60,42 +58,28 @@ def read_mesh(
     return mesh
 
 
+@cached_by_file(8, MOST_BYTES)
 def mesh_in_file(path: str) -> FoundMesh:
-    stat = _checked_file(path)
-    return _found(path, stat.st_mtime_ns, stat.st_size)
+    vertices, triangles, rounding = read_triangles(path)
+    return found_mesh(vertices, triangles, repr(path), rounding)
 
 
 def triangles_in_file(path: str) -> tuple[Points, Numbers]:
     """Read the vertices (m, 3), in the file's unit, and triangles (k, 3) of a possibly open surface; raise
     `InputError`."""
-    _checked_file(path)
     vertices, triangles, _ = read_triangles(path)
     if not np.isfinite(vertices).all():
         raise InputError(f"{path!r} has a vertex that is not finite: export the mesh once more.")
     return vertices, triangles
 
 
-def _checked_file(path: str) -> os.stat_result:
-    if Path(path).suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
-    try:
-        stat = regular_file(path, MOST_BYTES)
-    except OSError as problem:
-        raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
-    if not stat.st_size:
-        raise InputError(f"{path!r} is empty: export the mesh once more.")
-    return stat
-
-
-@lru_cache(maxsize=8)
-def _found(path: str, changed: int, size: int) -> FoundMesh:
-    vertices, triangles, rounding = read_triangles(path)
-    return found_mesh(vertices, triangles, repr(path), rounding)
-
-
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
     """Read the vertices (m, 3) and at least one triangle (k, 3) of all bodies in a file, placed as in the file's scene,
     in its unit of length. Also return the rounding step of coordinates, 0 if not float32. Raises `InputError`."""
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
+    if not Path(path).stat().st_size:
+        raise InputError(f"{path!r} is empty: export the mesh once more.")
     rounding, is_single = 0.0, _is_single(path)
     vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
     scene = _scene(path)

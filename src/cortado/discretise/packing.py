@@ -139,30 +139,6 @@ def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
 
-@dataclass(frozen=True)
-class Linearised:
-    kernels: Any
-    equations: Any
-    sums: Points
-    """(n,) [1 / m^d]"""
-    distances: Points
-    """(m,) distances of close pairs [m]."""
-
-    def multiply(self, moves: Points) -> tuple[Points, Points]:
-        """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] for moves (n, 3) [m]."""
-        changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
-        self._launch(self.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
-        return changes, approaches
-
-    def multiply_back(self, changes: Points, approaches: Points) -> Points:
-        moves = np.zeros((len(changes), 3))
-        self._launch(self.kernels.multiply_back, moves=moves, changes=changes, approaches=approaches)
-        return moves
-
-    def _launch(self, kernel: Any, **arrays: Points) -> None:
-        launch_on_cpu(kernel, len(self.sums), in_bands=False, equations=self.equations, **arrays)
-
-
 class Relaxation:
     """Least-squares problem for the positions of the first n of the points around, of which the ``free`` (n,) ones move
     and the ``stays`` (n,) ones do not see air. Pairs are listed once, because moves are small."""
@@ -187,19 +163,19 @@ class Relaxation:
         from scipy.sparse.linalg import LinearOperator, lsmr
 
         spacing, count = self._around.lattice.spacing, len(self._free)
-        equations = self.linearised(NEAR * spacing)
-        errors = density_errors(self._around, equations.sums, self._stays)
+        self.linearise(NEAR * spacing)
+        errors = density_errors(self._around, self.sums, self._stays)
         counted = (~self._stays | (errors > HIGHEST)).astype(np.float64)
         unit, held = spacing * self._around.volume * counted, ~self._free
-        gaps = NEAR - equations.distances / spacing
+        gaps = NEAR - self.distances / spacing
         wanted = np.concatenate([counted * (np.clip(errors, *AIM) - errors), PUSH * gaps])
 
         def multiply(moves: Points) -> Points:
-            changes, approaches = equations.multiply(moves.reshape(-1, 3))
+            changes, approaches = self.multiply(moves.reshape(-1, 3))
             return np.concatenate([unit * changes, PUSH * approaches])
 
         def multiply_back(wrong: Points) -> Points:
-            moves = equations.multiply_back(unit * wrong[:count], PUSH * wrong[count:])
+            moves = self.multiply_back(unit * wrong[:count], PUSH * wrong[count:])
             moves[held] = 0.0
             return moves.ravel()
 
@@ -207,12 +183,13 @@ class Relaxation:
         found = lsmr(product, wanted, damp=DAMPING, maxiter=MOST_INNER_ROUNDS, atol=1e-3, btol=1e-3)[0]
         return np.asarray(found.reshape(-1, 3))
 
-    def linearised(self, close: float) -> Linearised:
-        """Return the derivatives at the current positions; pairs are close below ``close`` [m]."""
+    def linearise(self, close: float) -> None:
+        """Compute the sums (n,) [1 / m^d] and the distances (m,) [m] of pairs closer than ``close`` [m], and their
+        derivatives, at the current positions."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
         at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
-        sums, distances = np.full(count, at_its_place), np.empty(most)
-        close_starts = np.zeros(count + 1, dtype=np.int32)
+        self.sums, distances = np.full(count, at_its_place), np.empty(most)
+        self._equations, close_starts = kernels.equations(), np.zeros(count + 1, dtype=np.int32)
         arrays: dict[str, NDArray[Any]] = {
             "starts": np.zeros(count + 1, dtype=np.int32),
             "others": np.empty(most, dtype=np.int32),
@@ -222,12 +199,24 @@ class Relaxation:
             "close_others": np.empty(most, dtype=np.int32),
             "directions": np.empty((most, 3)),
         }
-        equations = kernels.equations()
         for name, array in arrays.items():
-            setattr(equations, name, shared(array))
-        found = {"sums": sums, "equations": equations, "distances": distances}
-        launch_on_cpu(kernels.linearise, count, in_bands=False, close=close, **found, **self._given)
-        return Linearised(kernels, equations, sums, distances[: close_starts[-1]])
+            setattr(self._equations, name, shared(array))
+        self._launch(kernels.linearise, sums=self.sums, distances=distances, close=close, **self._given)
+        self.distances = distances[: close_starts[-1]]
+
+    def multiply(self, moves: Points) -> tuple[Points, Points]:
+        """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] for moves (n, 3) [m]."""
+        changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
+        self._launch(self._around.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
+        return changes, approaches
+
+    def multiply_back(self, changes: Points, approaches: Points) -> Points:
+        moves = np.zeros((len(changes), 3))
+        self._launch(self._around.kernels.multiply_back, moves=moves, changes=changes, approaches=approaches)
+        return moves
+
+    def _launch(self, kernel: Any, **arguments: Any) -> None:
+        launch_on_cpu(kernel, len(self.sums), in_bands=False, equations=self._equations, **arguments)
 
 
 MOST_LOOKS, MOST_ROUNDS = 12, 36

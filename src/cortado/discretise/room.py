@@ -82,10 +82,7 @@ class Region:
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         """Test (n,) which points (n, d) [m] are at most ``tolerance`` [m] outside."""
-        found = self._from_axis(points) <= self.radius + tolerance
-        for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
-            found &= (x >= lower - tolerance) & (x <= upper + tolerance)
-        return np.asarray(found)
+        return np.asarray(self.distance(points) <= tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
         """Return the fraction (n,) inside the region of the cell, a spacing [m] wide, around each point (n, d) [m];

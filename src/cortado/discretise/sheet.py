@@ -11,7 +11,7 @@ from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Numbers, Points, Which, in_space, launch_on_cpu
 from cortado.discretise.solid import Faces, Solid, nearest_on_edges
 from cortado.discretise.solid_walls import DENSITY, WallPoints, frames, surface_points
-from cortado.discretise.walls import Places, RestLattice, WallLayers, uneven_changes, wall_weights
+from cortado.discretise.walls import Places, RestLattice, WallLayers, wall_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,5 +178,5 @@ def sheet_weights(
     around = replace(room, solids=(*room.solids, sheet))
     places = about.some(around.contains(found, -least))
     walls, weights = np.concatenate(points), np.concatenate(flat)
-    seen = places, lattice, around, np.zeros(lattice.dimension), uneven_changes, len(walls) - own
+    seen = places, lattice, around, np.zeros(lattice.dimension), False, len(walls) - own
     return wall_weights(walls, weights, *seen, partial(sheet.crossed, spacing=spacing))[:own]

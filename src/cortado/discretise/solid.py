@@ -7,7 +7,6 @@ from math import factorial
 import numpy as np
 
 from cortado.discretise.shapes import Numbers, Points, whole_origin
-from cortado.discretise.shapes import corners as corners_of
 
 
 @dataclass(frozen=True)
@@ -27,44 +26,6 @@ class Faces:
         return Faces(self.vertices, self.corners[:, ::-1])
 
 
-def box_faces(half: Points) -> Faces:
-    """Return the faces of a box centred at the origin, with half lengths (d,) [m]."""
-    if len(half) == 2:
-        return polygon_faces(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    squares = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return Faces(half * signs, np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))]))
-
-
-def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """Return the faces of the part of a box, between corners (d,) [m], below a plane at ``height`` [m] along its normal
-    (d,)."""
-    from scipy.spatial import ConvexHull
-
-    ends = corners_of(lower, upper)
-    heights = ends @ normal - height
-    first, second = np.nonzero((heights[:, None] < 0.0) & (heights[None] > 0.0))
-    edges = (ends[first] != ends[second]).sum(axis=1) == 1
-    first, second = first[edges], second[edges]
-    along = (heights[first] / (heights[first] - heights[second]))[:, None]
-    hull = ConvexHull(np.concatenate([ends[heights <= 0.0], ends[first] + along * (ends[second] - ends[first])]))
-    if len(lower) == 2:
-        return polygon_faces(hull.points[hull.vertices])
-    a, b, c = np.moveaxis(hull.points[hull.simplices], 1, 0)
-    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
-    return Faces(hull.points, np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices).astype(np.int64))
-
-
-def polygon_faces(corners: Points) -> Faces:
-    """Return the edges of a polygon (m, 2) [m], given clockwise or counterclockwise."""
-    following = np.roll(corners, -1, axis=0)
-    (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
-    area = (x * y_next - x_next * y).sum()
-    ordered = corners if area > 0.0 else corners[::-1]
-    numbers = np.arange(len(corners))
-    return Faces(ordered, np.stack([numbers, np.roll(numbers, -1)], axis=1))
-
-
 def nearest_on_edges(points: Points, edges: Points) -> Points:
     """Return the nearest points (n, 2) of edges (k, 2, 2) to points (n, 2) [m]."""
     best, found = np.full(len(points), np.inf), np.zeros_like(points)
@@ -76,54 +37,6 @@ def nearest_on_edges(points: Points, edges: Points) -> Points:
         nearer = squares < best
         best, found[nearer] = np.minimum(best, squares), places[nearer]
     return found
-
-
-def arc(centre: Points, radius: float, start: float, end: float, fine: float) -> Points:
-    """Return points (m, 2) [m] of an arc from one angle to another [rad], about ``fine`` [m] apart."""
-    count = max(int(np.ceil(abs(end - start) * radius / fine)), 4)
-    angles = np.linspace(start, end, count + 1)
-    return centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
-def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
-    """Return the faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. The profile is the
-    cross-section through the axis, symmetric about the axis."""
-    count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
-    angles = 2.0 * np.pi * np.arange(count) / count
-    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    first, second = [k for k in range(3) if k != axis]
-    mirrored = -1.0 if axis == 1 else 1.0  # x, z and y make a left-handed frame
-    vertices, corners = list[Points](), list[Numbers]()
-    for start, end in outer_edges(profile):
-        base = len(vertices) * count
-        for radius, height in (start, end):
-            ring = np.full((count, 3), height)
-            ring[:, first], ring[:, second] = radius * around[:, 0], mirrored * radius * around[:, 1]
-            vertices.append(ring)
-        here, there = base + np.arange(count), base + np.roll(np.arange(count), -1)
-        if start[0] > 0.0:
-            corners.append(np.stack([here, there, here + count], axis=1))
-        if end[0] > 0.0:
-            corners.append(np.stack([there, there + count, here + count], axis=1))
-    return Faces(np.concatenate(vertices), np.concatenate(corners))
-
-
-def outer_edges(profile: Faces) -> Points:
-    """Return starts and ends (k, 2, 2) [m] of the edges of a profile, cut off at the axis."""
-    edges = profile.vertices[profile.corners]
-    return np.array([[_cut(start, end), _cut(end, start)] for start, end in edges if max(start[0], end[0]) > 0.0])
-
-
-def _cut(start: Points, end: Points) -> Points:
-    """Return the start (2,) of an edge, or the edge's intersection with the axis if the start is beyond."""
-    if start[0] >= 0.0:
-        return start
-    return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
-
-
-NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
-"""Nodes of three-point Gauss quadrature on [0, 1], exact for polynomials of degree 5."""
-WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
 @dataclass(frozen=True)
@@ -148,25 +61,6 @@ def enclosed_moments(corners: Points, weights: Points) -> Moments:
     middle = np.asarray((cones[:, None] * sums).sum(axis=0) / ((d + 1.0) * cones.sum()))
     products = np.einsum("k,kci,kcj->ij", cones, about, about) + np.einsum("k,ki,kj->ij", cones, sums, sums)
     return Moments(volume, origin + middle, products / factorial(d + 2) - volume * np.outer(middle, middle))
-
-
-def revolved_moments(edges: Points, axis: int) -> Moments:
-    """Return the moments of a solid of revolution about an axis of space, from the edges (k, 2, 2) [m] of its profile
-    on one side of the axis. Coordinates are radius and height; edges run counterclockwise, and edges on the axis may be
-    left out."""
-    height = edges[..., 1].mean()
-    start, end = edges[:, 0], edges[:, 1]
-    x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
-
-    def integral(p: int, q: int) -> float:
-        """Return the integral of x^p (y - height)^q over the profile, by Green's theorem."""
-        return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
-
-    volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[axis]
-    middle = integral(1, 1) / integral(1, 0)
-    across, upright = np.pi * integral(3, 0), 2.0 * np.pi * integral(1, 2) - volume * middle**2
-    second = across * np.eye(3) + (upright - across) * np.outer(along, along)
-    return Moments(volume, (height + middle) * along, second)
 
 
 class Solid(ABC):

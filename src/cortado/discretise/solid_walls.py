@@ -288,28 +288,19 @@ class ExposedSurface:
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
         """Find the surface of solids, and of the container near them, that fluid can touch, as points spacing / `FINE`
         apart. Along periodic axes it extends a support beyond the period, which starts at ``lower`` (d,) [m]."""
-        room, spacing, fine = container.room, container.spacing, container.spacing / FINE[len(lower)]
+        fine = container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
         feet, away = (np.concatenate(parts) for parts in zip(*found, strict=True))
         owner = np.repeat(np.arange(len(found)), [len(part) for part, _ in found])
-        free = _within_a_period(feet, lower, room.periods, container.support) & _is_exposed(feet, away, room, spacing)
+        free = _within_a_period(feet, lower, container.room.periods, container.support)
+        free &= _is_exposed(feet, away, container)
         return cls(feet[free], away[free], owner[free], [*container.solids, *solids], container, lower)
-
-    @property
-    def room(self) -> Room:
-        """Return the room for fluid."""
-        return self.container.room
-
-    @property
-    def spacing(self) -> float:
-        """Return the spacing of particles [m]."""
-        return self.container.spacing
 
     @property
     def _fine(self) -> float:
         """Return the spacing of fine points [m]."""
-        return self.spacing / FINE[self.feet.shape[1]]
+        return self.container.spacing / FINE[self.feet.shape[1]]
 
     @cached_property
     def _tree(self) -> Any:
@@ -321,16 +312,15 @@ class ExposedSurface:
         """Build wall particles in layers at the depths of a flat wall's layers. Each has the weight of a flat wall's
         area equal to its part of the layer; at smaller depths the weight is reduced, so that the first row of fluid
         sees the same. No depth exceeds the layer's, even if a foot is hidden where parts of a solid overlap."""
-        parts, first_row = [], 0.5 * self.spacing
+        parts, spacing = [], lattice.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)
             feet = self._feet_of(found.points, *self._tree.query(found.points)) - found.points
-            found_depths = np.minimum(np.linalg.norm(feet, axis=1) / self.spacing, depth / self.spacing + TOLERANCE)
+            found_depths = np.minimum(np.linalg.norm(feet, axis=1) / spacing, depth / spacing + TOLERANCE)
             depths, which = np.unique(np.round(found_depths, DIGITS), return_inverse=True)
-            seen = np.array([lattice.plane_weight(first_row + self.spacing * one) for one in depths])[which]
-            parts.append(
-                WallPoints(found.points, weight * found.shares * lattice.plane_weight(first_row + depth) / seen, feet)
-            )
+            seen = np.array([lattice.plane_weight(0.5 * spacing + spacing * one) for one in depths])[which]
+            flat = weight * found.shares * lattice.plane_weight(0.5 * spacing + depth) / seen
+            parts.append(WallPoints(found.points, flat, feet))
         return WallPoints.joined(parts)
 
     def owners(self, walls: WallPoints) -> Numbers:
@@ -341,8 +331,10 @@ class ExposedSurface:
         """Return points about a spacing apart, ``depth`` [m] below the surface, or in the middle of thinner parts.
         Points where the container keeps its wall particles are left out."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
-        points = points[_within_a_period(points, self.lower, self.room.periods, 0.0) & ~self.container.keeps(points)]
-        found = evenly_chosen(points, self._fine, DENSITY * self.spacing)
+        points = points[
+            _within_a_period(points, self.lower, self.container.room.periods, 0.0) & ~self.container.keeps(points)
+        ]
+        found = evenly_chosen(points, self._fine, DENSITY * self.container.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
@@ -355,14 +347,14 @@ class ExposedSurface:
             beyond = furthest - depth - 0.5 * fine
             away = self._tree.query(points, distance_upper_bound=furthest)[0]
             near = np.isfinite(away) & (away > depth - 0.5 * fine - beyond)
-            near[near] = self.room.distance(points[near], beyond) > -beyond
+            near[near] = self.container.room.distance(points[near], beyond) > -beyond
             return near
 
         lower, upper = self.feet.min(axis=0), self.feet.max(axis=0)
         for points in lattice_about(lower, upper, depth + 0.5 * fine, fine, is_near):
             away, nearest = self._tree.query(points, distance_upper_bound=depth + fine)
             beneath = np.isfinite(away) & (away > depth - 0.5 * fine)
-            beneath[beneath] = self.room.distance(points[beneath], fine) > 0.0
+            beneath[beneath] = self.container.room.distance(points[beneath], fine) > 0.0
             points = points[beneath]
             feet = self._feet_of(points, away[beneath], nearest[beneath])
             down = points - feet
@@ -383,7 +375,7 @@ class ExposedSurface:
                 near = near[np.abs(solid.distance_up_to(points, furthest)) < within]
             feet = solid.nearest(points[near])
             up, distances = feet - points[near], np.linalg.norm(feet - points[near], axis=1)
-            free = _is_exposed(feet, up / np.maximum(distances, 1e-300)[:, None], self.room, self.spacing)
+            free = _is_exposed(feet, up / np.maximum(distances, 1e-300)[:, None], self.container)
             free &= distances < within[near]
             near = near[free]
             found[near], best[near] = feet[free], distances[free]
@@ -401,8 +393,8 @@ class ExposedSurface:
             pair = (owner == first) & (other == second)
             for _ in range(EXPOSED_ROUNDS):
                 found[pair] = self.solids[first].nearest(self.solids[second].nearest(found[pair]))
-        near = np.linalg.norm(found - feet, axis=1) < self.spacing
-        near &= self._tree.query(found)[0] < EDGE * self.spacing  # not where one covers the other
+        near = np.linalg.norm(found - feet, axis=1) < self.container.spacing
+        near &= self._tree.query(found)[0] < EDGE * self.container.spacing  # not where one covers the other
         return np.where(near[:, None], found, feet)
 
     def _in_the_middle(self, depth: float) -> Points:
@@ -416,7 +408,7 @@ class ExposedSurface:
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
         """Test (n,) whether each foot is the nearest point of the surface to the point at a depth (n,) [m] below it."""
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
-        return np.asarray(distances > depths - TOLERANCE * self.spacing)
+        return np.asarray(distances > depths - TOLERANCE * self.container.spacing)
 
 
 def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
@@ -425,10 +417,10 @@ def _within_a_period(points: Points, lower: Points, periods: Points, reach: floa
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
-def _is_exposed(feet: Points, away: Points, room: Room, spacing: float) -> Which:
-    """Test (n,) which points of surfaces (n, d) [m], with unit vectors (n, d) away from the solids, fluid in a room can
-    touch."""
-    return room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
+def _is_exposed(feet: Points, away: Points, container: ContainerWalls) -> Which:
+    """Test (n,) which points of surfaces (n, d) [m], with unit vectors (n, d) away from the solids, fluid can touch."""
+    spacing = container.spacing
+    return container.room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 
 
 def solid_places(solid: Solid, spacing: float, reach: float) -> Places:

@@ -283,10 +283,6 @@ def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed 
     return np.asarray(found)
 
 
-Fit = Callable[["csr_array", Points], Points]
-"""Function from a matrix (m, b) and the wanted product (m,) to relative changes (b,) of flat-wall weights."""
-
-
 def wall_weights(
     walls: Points,
     flat: Points,
@@ -294,7 +290,7 @@ def wall_weights(
     lattice: RestLattice,
     room: Room,
     lower: Points,
-    fit: Fit,
+    are_even: bool,
     known: int = 0,
     crossed: Crossed | None = None,
 ) -> Points:
@@ -311,57 +307,46 @@ def wall_weights(
         lattice: the lattice of the fluid at rest.
         room: the room for fluid.
         lower: (d,) start of the period [m].
-        fit: `even_changes`, or `uneven_changes` for particles off a lattice.
+        are_even: True for particles on lattices, whose weights are at least 0; others have the weight `LEAST` or more.
         known: number of wall particles, the last ones, with known weights.
         crossed: the test for the sheet to which the wall particles belong, except the known ones. Fluid interacts with
             them only through the sheet.
     """
-    from scipy.sparse import vstack
+    from scipy.sparse import coo_array, vstack
 
-    sought, changes = len(walls) - known, np.zeros(len(walls))
+    sought, changes, is_sheet = len(walls) - known, np.zeros(len(walls)), np.zeros(len(walls), dtype=bool)
     if not sought or not len(places):
         return flat.copy()
-    chunks = [places.some(slice(start, start + CHUNK)) for start in range(0, len(places), CHUNK)]
-    is_sheet = np.arange(len(walls)) < (0 if crossed is None else sought)
-    demands = [_demands(walls, flat, chunk, lattice, room, lower, is_sheet, crossed) for chunk in chunks]
-    sums = vstack([part for part, _ in demands]).tocsr()
-    left = np.concatenate([part for _, part in demands]) - sums.sum(axis=1)
+    is_sheet[:sought] = crossed is not None
+
+    def demands(places: Places) -> tuple["csr_array", Points]:
+        """Return a matrix (m, b) of sums over wall particles at places, as functions of weights relative to flat walls,
+        and the sums (m,) that fluid at rest needs there."""
+        place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
+        if crossed is not None:
+            seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
+            place, wall = place[seen], wall[seen]
+        separations = apart(places.points[place] - walls[wall], room.periods)
+        shape, indices = (len(places), len(walls)), (place.astype(np.int32), wall.astype(np.int32))
+        parts = flat[wall, None] * lattice.sums(separations)
+        densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in parts.T)
+        missing = _missing(lattice, places, room, crossed)
+        near = ~room.contains(places.points, -lattice.spacing)
+        sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
+        return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])
+
+    found = [demands(places.some(slice(start, start + CHUNK))) for start in range(0, len(places), CHUNK)]
+    sums = vstack([part for part, _ in found]).tocsr()
+    left = np.concatenate([part for _, part in found]) - sums.sum(axis=1)
     own = sums[:, :sought]
     seen = np.diff(own.indptr) > 0
-    changes[:sought] = fit(own[seen], left[seen])
+    changes[:sought] = (even_changes if are_even else uneven_changes)(own[seen], left[seen])
     return np.asarray(flat * (1.0 + changes), dtype=np.float64)
 
 
-def _demands(
-    walls: Points,
-    flat: Points,
-    places: Places,
-    lattice: RestLattice,
-    room: Room,
-    lower: Points,
-    is_sheet: Which,
-    crossed: Crossed | None,
-) -> tuple["csr_array", Points]:
-    """Return a matrix (m, b) of sums over wall particles at places, as functions of weights relative to flat walls, and
-    the sums (m,) that fluid at rest needs there."""
-    from scipy.sparse import coo_array, vstack
-
-    place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
-    if crossed is not None:
-        seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
-        place, wall = place[seen], wall[seen]
-    separations = apart(places.points[place] - walls[wall], room.periods)
-    shape, indices = (len(places), len(walls)), (place.astype(np.int32), wall.astype(np.int32))
-    parts = flat[wall, None] * lattice.sums(separations)
-    densities, *gradients = (coo_array((part, indices), shape=shape).tocsr() for part in parts.T)
-    missing = _missing(lattice, places, room, crossed)
-    near = ~room.contains(places.points, -lattice.spacing)
-    sums = vstack([densities, *(BALANCE * gradient[near] for gradient in gradients)]).tocsr()
-    return sums, np.concatenate([missing[:, 0], 2.0 * BALANCE * missing[near, 1:].T.ravel()])
-
-
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Find changes of weights, a `Fit`, for wall particles on lattices; weights are at least 0."""
+    """Return the relative changes (b,) of flat-wall weights with which a matrix (m, b) gives the wanted product (m,),
+    for wall particles on lattices; weights are at least 0."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 
@@ -372,7 +357,7 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Find changes of weights, a `Fit`, for evenly spaced particles off a lattice; weights are at least `LEAST`."""
+    """Return changes as `even_changes`, for evenly spaced particles off a lattice; weights are at least `LEAST`."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)

@@ -12,15 +12,17 @@ import secrets
 import socket
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from cortado.errors import ComputationError, InputError, shown
 
+Found = TypeVar("Found")
 OTHERS = (
     (stat.S_ISDIR, "a directory"),
     (stat.S_ISFIFO, "a pipe"),
@@ -53,6 +55,26 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
     if found.st_size > most:
         raise _too_large(found.st_size, most)
     return found
+
+
+def cached_by_file(kept: int, most: int) -> Callable[[Callable[..., Found]], Callable[..., Found]]:
+    """Cache the last results of a function of a file's path, and of more, until the file has another time or size. The
+    function raises `InputError` for a file that is not regular or has over ``most`` bytes."""
+
+    def decorated(read: Callable[..., Found]) -> Callable[..., Found]:
+        known = lru_cache(kept)(lambda version, path, *more: read(path, *more))
+
+        @wraps(read)
+        def call(path: str, *more: Any) -> Found:
+            try:
+                stat = regular_file(path, most)
+            except OSError as problem:
+                raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
+            return known((stat.st_mtime_ns, stat.st_size), path, *more)
+
+        return call
+
+    return decorated
 
 
 def content(path: str | os.PathLike[str], most: int) -> bytes:

@@ -29,7 +29,7 @@ from cortado.lazy import on_top
 from cortado.optimisation.evaluator import Evaluator, Optimisable, Parameters, Record, as_given
 from cortado.optimisation.optimisers import as_optimiser
 from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, ReplayLog, Search, Vector
-from cortado.scene.parameter_values import Values
+from cortado.scene.parameter_values import Values, require_points
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """A function from parameters by name to the loss and its gradient by name."""
@@ -197,8 +197,7 @@ def evaluate(
     """
     require_function("on_result", on_result, "the number of a point", "its Estimate")
     require_methods("problem", problem, ("value",), "a cortado.Problem")
-    if not isinstance(points, Iterable) or isinstance(points, (str, bytes, Mapping)):
-        raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")
+    require_points(points, are_read=False)
     if loss_if_diverged is not None:
         loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
     chosen = checked_executor(InProcess() if executor is None else executor)

@@ -15,9 +15,9 @@ from cortado.errors import InputError, shown
 from cortado.runs.particle_sums import LoadSum, Summed
 from cortado.runs.quantity_formulas import SIX, Bars, QuantityFormula
 from cortado.runs.sensor import Reading, SensedScene, named
+from cortado.scene.links import Ends
 from cortado.scene.motions import Pose, angular_velocity_name, position_name, velocity_name
 from cortado.scene.parameters import load_name
-from cortado.scene.springs import Ends
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.parts import StepContext, Tangents
 from cortado.sph.springs import NUMBERS, PoseBars, Springs, numbers_of, springs_in

@@ -17,20 +17,12 @@ from cortado.errors import Words, shown
 from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable, check_columns, check_fed
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
-from cortado.scene.hinges import check_hinges
+from cortado.scene.links import check_hinges, check_springs
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
-from cortado.scene.sensor_tables import (
-    BodyMotionTable,
-    FlowRateTable,
-    PressureProbeTable,
-    SolidLoadTable,
-    SpringForceTable,
-)
 from cortado.scene.shape_tables import MeshShape, check_length
 from cortado.scene.solids import check_free_body
-from cortado.scene.springs import check_springs
 from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, check_name, field_error, field_name, usable_file
 
@@ -45,11 +37,9 @@ def check_free_bodies(scene: SceneTables) -> None:
     bodies = free(scene.solid)
     if not bodies:
         return
-    if scene.solver.kind != "projection":
-        why = f"as the solid {bodies[0].name!r} is free, and pressures that are not shared with it move it"
-        raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}')
-    if not scene.forces.pressure:
-        raise field_error(("forces", "pressure"), False, f"true, as the solid {bodies[0].name!r} is free")
+    _check_solver(
+        scene, f"as the solid {bodies[0].name!r} is free", ", and pressures that are not shared with it move it"
+    )
     rubbed = next((body for body in bodies if body.sticks), None)
     if rubbed is not None and scene.forces.viscous_solve == "explicit":
         wanted = f'"implicit" or "automatic", as the solid {rubbed.name!r} is free and has no slip'
@@ -76,16 +66,21 @@ def check_sheets(scene: SceneTables) -> None:
     if name is None:
         return
     why = f"as the solid {name!r} is a sheet"
-    if scene.solver.kind != "projection":
-        raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}')
-    if not scene.forces.pressure:
-        raise field_error(("forces", "pressure"), False, f"true, {why}")
+    _check_solver(scene, why)
     if scene.periods[1].any():
         axis = int(np.argmax(scene.periods[1] > 0.0))
         raise field_error(("container", "periodic", axis), True, f"false, {why}, and sheets have no periodic images")
     for index, table in enumerate(scene.solid):
         if table.motion == "free":
             raise field_error(("solid", index, "motion"), "free", f'"fixed" or "path", {why}, through which bodies go')
+
+
+def _check_solver(scene: SceneTables, why: str, and_why: str = "") -> None:
+    """Check that a scene with solids that only the projection handles is solved by it, with pressure."""
+    if scene.solver.kind != "projection":
+        raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}{and_why}')
+    if not scene.forces.pressure:
+        raise field_error(("forces", "pressure"), False, f"true, {why}")
 
 
 def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
@@ -277,19 +272,19 @@ def _check_sensors(scene: SceneTables) -> None:
     moving = [solid.name for solid in scene.solid if solid.moves]
     for index, sensor in enumerate(scene.sensor):
         path = "sensor", index
-        if isinstance(sensor, SolidLoadTable):
+        if sensor.kind == "solid_load":
             check_name((*path, "solid"), sensor.solid, names, "a solid", "of a scene with solids")
             if sensor.axes == "body" and sensor.solid not in moving:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the solid is at rest')
-        elif isinstance(sensor, SpringForceTable):
+        elif sensor.kind == "spring_force":
             check_name((*path, "spring"), sensor.spring, springs, "a spring", "of a scene with springs")
-        elif isinstance(sensor, BodyMotionTable):
+        elif sensor.kind == "body_motion":
             check_free_body((*path, "solid"), sensor.solid, scene.solid)
-        elif not isinstance(sensor, FlowRateTable):
+        elif sensor.kind != "flow_rate":
             if sensor.on is not None:
                 wanted = "left out, as no solid moves"
                 check_name((*path, "on"), sensor.on, moving, "a solid that moves", wanted)
-            if not isinstance(sensor, PressureProbeTable) and sensor.axes == "body" and sensor.on is None:
+            if sensor.kind != "pressure_probe" and sensor.axes == "body" and sensor.on is None:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the sensor is on no solid')
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.errors import InputError, Words, shown
-from cortado.files.disk import name_and_unit, read_columns, reason, regular_file
+from cortado.files.disk import cached_by_file, name_and_unit, read_columns
 from cortado.scene.tables import GREATEST, MISSING, FieldPath, field_error, quantity, usable_file
 
 Interpolation = Literal["linear", "spline"]
@@ -138,6 +138,7 @@ Columns = tuple[tuple[str, str], ...]
 """Names of columns, each with its unit in scenes."""
 
 
+@cached_by_file(8, MOST_BYTES)
 def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArray, dict[str, NDArray]]:
     """Return the times (k,) [s] of a CSV file and its columns (k,) in the units of a scene.
 
@@ -149,18 +150,6 @@ def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArra
         columns: allowed columns besides the time.
         needs_all: True if the file must have all of these columns, False for at least one.
     """
-    try:
-        stat = regular_file(file, MOST_BYTES)
-    except OSError as problem:
-        raise InputError(f"{file} cannot be read: {reason(problem)}.") from None
-    return _values(file, columns, needs_all, stat.st_mtime_ns, stat.st_size)
-
-
-@lru_cache(maxsize=8)
-def _values(
-    file: str, columns: Columns, needs_all: bool, changed: int, size: int
-) -> tuple[NDArray, dict[str, NDArray]]:
-    """Read a file; its modification time and size make the cache notice a new version."""
     known, found = dict((("time", "s"), *columns)), dict[str, NDArray]()
     listed = ", ".join(f"{name} [{next(iter(UNITS[unit]))}]" for name, unit in known.items())
     for head, values in read_columns(file).items():
@@ -182,14 +171,29 @@ def _values(
     if "time" in missing or len(found) < 2 or (needs_all and missing):
         what = f"all of {listed}" if needs_all else f"time [s] and one or more of {listed.partition(', ')[2]}"
         raise InputError(f"{file} has no column {missing[0]!r}, but must have {what}.")
-    times = found.pop("time")
+    times = found["time"]
     later = np.flatnonzero(np.diff(times, prepend=np.nextafter(min(0.0, times[0]), -1.0)) <= 0.0)
     if len(later) or times[0] < 0.0 or len(times) < 2:
         row = int(later[0]) if len(later) else 0
         has = f"the time {times[row]:g} s in line {row + 2}" if len(later) or times[0] < 0.0 else "one line of numbers"
         wanted = "times from 0 on, each greater than the one before, at least two of them"
         raise InputError(f"{file} has {has}, but must have {wanted}.")
-    return times, found
+    return times, {name: values for name, values in found.items() if name != "time"}
+
+
+def lists_in_file(table: Any, path: FieldPath, columns: Columns, what: str, needs_all: bool) -> dict[str, Any]:
+    """Return the keys ``times`` and, for each column, such as ``torques``, from a table's file, in place of all others
+    that have such values; raise a `field_error`."""
+    names = [name for name, _ in columns]
+    for key in (*names, "times", *(f"{name}s" for name in names)):
+        if (found := getattr(table, key)) is not None:
+            raise field_error((*path, key), found, "left out, as there is a file")
+    with usable_file((*path, "file"), table.file, what):
+        times, columns_found = values_in_file(table.file, columns, needs_all)
+    if times[0] != 0.0:
+        raise field_error((*path, "file"), table.file, "a file with times from 0 on")
+    lists = {f"{name}s": tuple(values.tolist()) for name, values in columns_found.items()}
+    return {"file": None, "times": tuple(times.tolist()), **lists}
 
 
 WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}

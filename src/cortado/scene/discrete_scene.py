@@ -8,29 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cortado.discretise import smoothing
 from cortado.discretise.packing import Packing
 from cortado.discretise.room import Domain, Region, Room
 from cortado.discretise.shapes import Points, Rows, check_crowding
 from cortado.discretise.sheet import Sheet, sheet_points, sheet_weights
-from cortado.discretise.smoothing import (
-    SmoothingKernel,
-    lattice_laplacian_correction,
-    pressure_stiffness,
-    rest_volume,
-    smoothing_kernel,
-    wall_response,
-)
+from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.solid import Placed
 from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
-from cortado.discretise.walls import (
-    Places,
-    RestLattice,
-    WallLayers,
-    even_changes,
-    uneven_changes,
-    wall_layers,
-    wall_weights,
-)
+from cortado.discretise.walls import Places, RestLattice, WallLayers, wall_layers, wall_weights
 from cortado.errors import InputError, MassWarning, warn
 from cortado.scene.fluid_particles import FluidMasses, FluidSample, Surroundings, fluid_particles
 from cortado.scene.fluids import PointsFluid
@@ -81,13 +67,13 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
     still = [_kept(scene, container, layers, lattice)]
     if container.room.solids:
         still.append(_around(scene, container, still[0], layers, lattice))
-    periods, numbers, tables = scene.periods[1], wall_numbers(scene.solid), moving(scene.solid)
+    periods, tables = scene.periods[1], moving(scene.solid)
     sheets = [table for table in scene.solid if table.is_sheet and not table.moves]
-    still += _beside_sheets(sheets, [numbers[one.name] for one in sheets], container.room, still, layers, lattice)
+    still += _beside_sheets(scene, sheets, container.room, still, layers, lattice)
     empty = Room(Region.everywhere(scene.dimension), (), 0.0 * periods)
     for k, table in enumerate(tables):
         if table.is_sheet:
-            still += _beside_sheets([table], [k], empty, [], layers, lattice)
+            still += _beside_sheets(scene, [table], empty, [], layers, lattice)
         else:
             still.append(_alone(table, k, periods, layers, lattice))
     return Walls.joined(still)
@@ -105,7 +91,7 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
     lower, lengths = short.periods(dimension)
     room = Room(short.region(dimension).opened(lengths), (), lengths)
     places = short.places(dimension, lattice.spacing, lattice.support)
-    weights = wall_weights(sought.positions, sought.flat, places, lattice, room, lower, even_changes)
+    weights = wall_weights(sought.positions, sought.flat, places, lattice, room, lower, are_even=True)
     same = cKDTree(sought.positions).query(folded(points.positions))[1]
     return Walls.of(points, weights[same], scene.container.sticks)
 
@@ -160,8 +146,8 @@ def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, 
 
 
 def _beside_sheets(
+    scene: Scene,
     tables: Sequence[SolidTable],
-    numbers: Sequence[int],
     room: Room,
     others: Sequence[Walls],
     layers: WallLayers,
@@ -171,15 +157,15 @@ def _beside_sheets(
     interacts only with those behind the sheet (`cortado.particles.sheets`)."""
     if not tables:
         return []
-    sheets, found = list[Sheet](), list[Walls]()
-    for table, number in zip(tables, numbers, strict=True):
+    sheets, found, numbers = list[Sheet](), list[Walls](), wall_numbers(scene.solid)
+    for table in tables:
         about, middle, turn = table.own_solid(), table.middle(), table.turn(lattice.dimension)
         assert isinstance(about, Sheet)
         sheets.append(about.placed(middle, turn))
         points = sheet_points(about, layers, lattice)
         placed = replace(points, positions=middle + points.positions @ turn.T, feet=points.feet @ turn.T)
         walls = Walls.of(placed, points.flat, table.sticks)
-        found.append(replace(walls, solid=np.full(len(points), number)))
+        found.append(replace(walls, solid=np.full(len(points), numbers[table.name])))
     own, every = Walls.joined(found), Walls.joined([*found, *others])
     known = every.some(slice(len(own), None))
     both = (own.positions, known.positions), (own.weights, known.weights)
@@ -192,12 +178,12 @@ def _weighed(
 ) -> tuple[WallPoints, Points]:
     """Return wall particles beneath a surface, with weights fitted at the points ``beside`` and at points around the
     solids, in the presence of the walls ``kept``."""
-    room, spacing, reach = surface.room, lattice.spacing, lattice.support
+    room, spacing, reach = surface.container.room, lattice.spacing, lattice.support
     points = surface.walls(layers, lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
     places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
     walls, flat = np.concatenate([points.positions, kept.positions]), np.append(points.flat, kept.weights)
-    found = wall_weights(walls, flat, places, lattice, room, surface.lower, uneven_changes, len(kept.weights))
+    found = wall_weights(walls, flat, places, lattice, room, surface.lower, False, len(kept.weights))
     return points, found[: len(points)]
 
 
@@ -238,11 +224,11 @@ class Lattice:
             support=support,
             normalisation=kernel.normalisation(dimension, support),
             self_weight=float(kernel.weight(np.zeros(1), dimension, support)[0]),
-            volume=rest_volume(kernel, spacing, support, dimension),
+            volume=smoothing.rest_volume(kernel, spacing, support, dimension),
             cell=spacing**dimension,
-            stiffness=pressure_stiffness(kernel, spacing, support, dimension),
-            response=wall_response(kernel, spacing, support, dimension),
-            laplacian_correction=lattice_laplacian_correction(kernel, spacing, support, dimension),
+            stiffness=smoothing.pressure_stiffness(kernel, spacing, support, dimension),
+            response=smoothing.wall_response(kernel, spacing, support, dimension),
+            laplacian_correction=smoothing.lattice_laplacian_correction(kernel, spacing, support, dimension),
             domain=domain,
         )
 
@@ -284,22 +270,17 @@ def discretise(scene: Scene) -> DiscreteScene:
         warn(sentence)
     if masses.warning:
         warn(masses.warning, MassWarning)
-    if scene.discretisation.jitter:
-        fluid = replace(fluid, positions=fluid.jittered(scene.discretisation.jitter * spacing))
-    fluid = replace(fluid, velocities=_velocities(scene, fluid))
+    if most := scene.discretisation.jitter * spacing:
+        moved = fluid.positions + np.random.default_rng(0).uniform(-most, most, fluid.positions.shape)
+        fluid = replace(fluid, positions=np.where(fluid.is_placed[:, None], fluid.positions, moved))
+    for body, end, size in zip(scene.fluid, np.cumsum(fluid.sizes), fluid.sizes, strict=True):
+        fluid.velocities[end - size : end] = body.velocities(fluid.positions[end - size : end])
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         of_lattice = kernel, support, lattice.volume, spacing
         told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, scene.periods, fluid.names)
         if told is not None:
             warn(told)
     return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, scene.periods[1])
-
-
-def _velocities(scene: Scene, fluid: FluidSample) -> Points:
-    found, ends = fluid.velocities.copy(), np.cumsum(fluid.sizes)
-    for body, end, size in zip(scene.fluid, ends, fluid.sizes, strict=True):
-        found[end - size : end] = body.velocities(fluid.positions[end - size : end])
-    return found
 
 
 def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:

@@ -9,10 +9,10 @@ from pydantic import Field, model_validator
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Points
 from cortado.errors import Words
-from cortado.scene.courses import Knots, check_over_time, values_in_file
-from cortado.scene.parameters import Axis, Parameter, Range, ending
+from cortado.scene.courses import Knots, check_over_time, lists_in_file
+from cortado.scene.parameters import Axis, Parameter, Range, Source, ending, of_part, spacing_of
 from cortado.scene.shape_tables import File, check_order
-from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity, usable_file
+from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 PRESCRIBED, BLENDED = 3.0, 3.0
 """Thickness of the shell around a sink with prescribed flow, and of the transition outside the shell [spacings]."""
@@ -96,26 +96,16 @@ class FlowTable(Table):
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if self.file is not None:
-            return self._read(dimension, path)
+            columns = (("flow_rate", "m3/s" if dimension == 3 else "m2/s"),)
+            lists = lists_in_file(self, path, columns, "the file of a flow rate", True)
+            if min(lists["flow_rates"]) < 0.0:
+                raise field_error((*path, "file"), self.file, "a file with flow rates of at least 0")
+            return self.model_copy(update=lists).in_dimension(dimension, path)
         if self.times is not None or self.flow_rates is not None:
             check_over_time(path, self, "flow_rates", "flow_rate")
         elif self.flow_rate is None:
             raise field_error((*path, "flow_rate"), MISSING, "given, or times with flow_rates, or a file")
         return super().in_dimension(dimension, path)
-
-    def _read(self, dimension: int, path: FieldPath) -> Self:
-        for key in ("flow_rate", "times", "flow_rates"):
-            if (found := getattr(self, key)) is not None:
-                raise field_error((*path, key), found, "left out, as there is a file")
-        with usable_file((*path, "file"), self.file, "the file of a flow rate"):
-            assert self.file is not None
-            times, found = values_in_file(self.file, (("flow_rate", "m3/s" if dimension == 3 else "m2/s"),), True)
-        rates = found["flow_rate"]
-        if times[0] != 0.0 or (rates < 0.0).any():
-            wanted = "a file with times from 0 on and flow rates of at least 0"
-            raise field_error((*path, "file"), self.file, wanted)
-        given = {"file": None, "times": tuple(times.tolist()), "flow_rates": tuple(rates.tolist())}
-        return self.model_copy(update=given).in_dimension(dimension, path)
 
     @property
     def course(self) -> Knots | None:
@@ -151,16 +141,13 @@ class FlowTable(Table):
         return float(np.interp(volume, volumes, times))
 
     def flow_parameter(self, dimension: int) -> Parameter:
-        return Parameter(
-            flow_name(self.name),
-            "m³/s" if dimension == 3 else "m²/s",
-            f"volume, in 2-D area, that flows through {self.name} in a second of each step",
-            Axis.STEP,
-            lambda source: np.array(self.begun),
-            range=Range.NOT_NEGATIVE,
-            change=lambda source, value: np.full(np.shape(value), max(self.greatest, float(np.max(value)))),
-            course=self.course,
-        )
+        unit, more = "m³/s" if dimension == 3 else "m²/s", {"range": Range.NOT_NEGATIVE, "course": self.course}
+        meaning = f"volume, in 2-D area, that flows through {self.name} in a second of each step"
+
+        def change(source: Source, value: Points) -> Points:
+            return np.full(np.shape(value), max(self.greatest, float(np.max(value))))
+
+        return of_part(flow_name(self.name), unit, meaning, self.begun, Axis.STEP, change=change, **more)
 
 
 class SinkDrain(FlowTable):
@@ -253,20 +240,10 @@ def drain_parameters(scene: Any) -> list[Parameter]:
     found = []
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
-            found += [drain.flow_parameter(scene.dimension), _position(drain, scene.discretisation.spacing)]
+            meaning = f"middle of the drain {drain.name}"
+            place = of_part(f"{drain.name}.position", "m", meaning, drain.position, change=spacing_of)
+            found += [drain.flow_parameter(scene.dimension), place]
     return found
-
-
-def _position(sink: SinkDrain, spacing: float) -> Parameter:
-    return Parameter(
-        f"{sink.name}.position",
-        "m",
-        f"middle of the drain {sink.name}",
-        Axis.SCALAR,
-        lambda source: np.array(sink.position),
-        components=lambda dimension, phases: dimension,
-        change=lambda source, value: spacing,
-    )
 
 
 DIRECTIONS = 1024

@@ -1,7 +1,7 @@
 """Emitters, columns of particles that leave at one speed: their tables and parameters."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -11,10 +11,11 @@ from pydantic import field_validator
 from cortado.discretise.shapes import ROUND_OFF, Points, across, disc, lattice, whole_cells
 from cortado.discretise.sheet import Sheet
 from cortado.errors import Words, shown
+from cortado.scene.courses import Knots
 from cortado.scene.drain_tables import FlowTable
 from cortado.scene.fluids import FluidBody
 from cortado.scene.motions import course_table
-from cortado.scene.parameters import Axis, Parameter, ending
+from cortado.scene.parameters import Axis, Parameter, ending, of_part, spacing_of
 from cortado.scene.tables import GREATEST, MISSING, FieldPath, Length, Text, Vector, field_error, quantity
 
 
@@ -68,17 +69,14 @@ emitted_name = ending("emitted")
 """Field: length of the column that has left an emitter [m]."""
 again_name = ending("again")
 """Field: number of each re-emitted particle in the emitter's line, from 1 on; 0 for other particles."""
-_PATH = Parameter(
-    "emitter_path",
-    "m",
-    "where the opening of an emitter is after each step",
-    Axis.STEP,
-    lambda source: np.zeros(source.scene.dimension),
-    components=lambda dimension, phases: dimension,
-    change=lambda source, value: source.scene.discretisation.spacing,
-    moment=1.0,
-)
-OutletPath: Any = course_table(_PATH)
+
+
+def _path_of(name: str, of: str, outlet: Any, course: Knots | None = None) -> Parameter:
+    meaning = f"where the opening of {of} is after each step"
+    return of_part(name, "m", meaning, outlet, Axis.STEP, change=spacing_of, moment=1.0, course=course)
+
+
+OutletPath: Any = course_table(_path_of("emitter_path", "an emitter", (0.0, 0.0)))
 
 
 class EmitterTable(FluidBody, FlowTable):
@@ -222,13 +220,12 @@ class EmitterTable(FluidBody, FlowTable):
 
 
 def emitter_parameters(scene: Any) -> list[Parameter]:
-    return [one for e in scene.emitter for one in (_path_parameter(e), e.flow_parameter(scene.dimension))]
-
-
-def _path_parameter(emitter: EmitterTable) -> Parameter:
-    outlet, course = np.array(emitter.outlet), None if emitter.path is None else emitter.path.knots
-    meaning = f"where the opening of the emitter {emitter.name} is after each step"
-    return replace(_PATH, name=path_name(emitter.name), meaning=meaning, value=lambda source: outlet, course=course)
+    found = []
+    for emitter in scene.emitter:
+        name, course = path_name(emitter.name), None if emitter.path is None else emitter.path.knots
+        found += [_path_of(name, f"the emitter {emitter.name}", emitter.outlet, course)]
+        found += [emitter.flow_parameter(scene.dimension)]
+    return found
 
 
 def check_fed(scene: Any) -> None:

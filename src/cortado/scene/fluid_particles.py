@@ -176,11 +176,6 @@ class FluidSample:
     places: Points
     """(n, d) positions of particles in reserve or taken by drains [m]."""
 
-    def jittered(self, most: float) -> Points:
-        """Return positions (n, d) [m] with random offsets of up to ``most`` [m], except for prescribed positions."""
-        moves = np.random.default_rng(0).uniform(-most, most, self.positions.shape)
-        return np.where(self.is_placed[:, None], self.positions, self.positions + moves)
-
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
         """Return the sample of the particles with sorted indices (m,), which must include all particles of emitters."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
@@ -208,27 +203,24 @@ def fluid_particles(scene: Scene) -> FluidSample:
     leave no room for any particle of a fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = scene.room, scene.discretisation.support_radius
-    bodies = [CutBody(body, room, spacing) if is_packed(body, room, reach, spacing) else None for body in scene.fluid]
-    positions = [
-        fluid.particles_in(room, spacing) if body is None else body.particles()
-        for fluid, body in zip(scene.fluid, bodies, strict=True)
-    ]
-    for index, (particles, body) in enumerate(zip(positions, bodies, strict=True)):
+    bodies, positions, velocities, asked = list[CutBody | None](), list[Points](), list[Points](), list[float]()
+    for index, fluid in enumerate(scene.fluid):
+        body = CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None
+        particles = fluid.particles_in(room, spacing) if body is None else body.particles()
         if not len(particles):
             raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
-    velocities = [fluid.velocities(x) for fluid, x in zip(scene.fluid, positions, strict=True)]
-    phases = [names.index(fluid.phase) for fluid in scene.fluid]
-    asked = [
-        fluid.volume(spacing) if body is None else body.asked for fluid, body in zip(scene.fluid, bodies, strict=True)
-    ]
+        bodies.append(body)
+        positions.append(particles)
+        velocities.append(fluid.velocities(particles))
+        asked.append(fluid.volume(spacing) if body is None else body.asked)
+    phases = [names.index(body.phase) for body in (*scene.fluid, *scene.emitter)]
     count = sum(map(len, positions)) + sum(len(e.sample(spacing).upstream) for e in scene.emitter)
     emitters, places = samples(scene, count), resting_places(scene, count)
-    for emitter, (_, first, sample) in zip(scene.emitter, emitters, strict=True):
+    for _, first, sample in emitters:
         waits = sample.upstream > sample.column
         sample.positions[waits], sample.velocities[waits] = places[first:][: len(waits)][waits], 0.0
         positions.append(sample.positions)
         velocities.append(sample.velocities)
-        phases.append(names.index(emitter.phase))
         bodies.append(None)
     sizes, nozzles = [len(x) for x in positions], len(scene.emitter)
     return FluidSample(

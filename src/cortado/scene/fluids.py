@@ -12,27 +12,8 @@ from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
 from cortado.discretise.solid import Placed, Solid
 from cortado.scene.point_files import read_points
-from cortado.scene.shape_tables import (
-    INDEX_OF_AXIS,
-    BoxShape,
-    CylinderShape,
-    File,
-    MeshShape,
-    PolygonShape,
-    SphereShape,
-)
-from cortado.scene.tables import (
-    FieldPath,
-    Length,
-    Rotation,
-    Table,
-    Text,
-    Turning,
-    Vector,
-    check_turn,
-    quantity,
-    rotation_matrix,
-)
+from cortado.scene.shape_tables import BoxShape, CylinderShape, File, MeshShape, PolygonShape, SphereShape
+from cortado.scene.tables import FieldPath, Length, Rotation, Table, Text, Turning, Vector, quantity, rotation_matrix
 
 ALIGNED = 1e-3
 """Largest distance of a surface from faces of lattice cells [spacings] for which the surface cuts no cell."""
@@ -67,7 +48,7 @@ class Fluid(FluidBody):
     counterclockwise."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        check_turn((*path, "angular_velocity"), self.angular_velocity, dimension)
+        self._check_turns(("angular_velocity",), dimension, path)
         return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
@@ -104,6 +85,13 @@ class RegionFluid(Fluid):
 
     @abstractmethod
     def block(self, spacing: float) -> Block: ...
+
+    @abstractmethod
+    def shape_about(self) -> tuple[Solid, Points]:
+        """Return the unrotated shape with its centroid at the origin, and the centroid (d,) that its keys imply [m]."""
+
+    def volume(self, spacing: float) -> float:
+        return self.shape_about()[0].moments().volume
 
     def count(self, spacing: float) -> float:
         return self.block(spacing).size
@@ -142,7 +130,7 @@ class Turnable(RegionFluid):
     counterclockwise."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        check_turn((*path, "rotation"), self.rotation, dimension)
+        self._check_turns(("rotation",), dimension, path)
         return super().in_dimension(dimension, path)
 
 
@@ -154,9 +142,6 @@ class BoxFluid(BoxShape, Turnable):
 
     def block(self, spacing: float) -> Block:
         return block_filling(self.lower, self.upper, spacing)
-
-    def volume(self, spacing: float) -> float:
-        return float(np.prod(np.subtract(self.upper, self.lower)))
 
     def cuts_cells(self, spacing: float) -> bool:
         lattice, sides = self.block(spacing), np.subtract(self.upper, self.lower)
@@ -191,9 +176,6 @@ class SphereFluid(SphereShape, RoundFluid):
     def block(self, spacing: float) -> Block:
         return block_about(self.centre, np.full(len(self.centre), self.radius), spacing)
 
-    def volume(self, spacing: float) -> float:
-        return self.shape_about()[0].moments().volume
-
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         return Region.ball(np.array(self.centre), self.radius).distance(points)
 
@@ -204,7 +186,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
     instead: ClassVar = '"box", "sphere" or "points"'
 
     def block(self, spacing: float) -> Block:
-        axis = INDEX_OF_AXIS[self.axis]
+        axis = self.along
         base, half = np.array(self.base), np.full(3, self.radius)
         half[axis] = 0.5 * self.height
         block = block_about(base, half, spacing)
@@ -215,7 +197,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return float(np.pi * self.radius**2 * self.height)
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        axis = INDEX_OF_AXIS[self.axis]
+        axis = self.along
         return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
@@ -223,7 +205,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
-        axis, base, cells = INDEX_OF_AXIS[self.axis], np.array(self.base), int(np.ceil(reach / min(along, across)))
+        axis, base, cells = self.along, np.array(self.base), int(np.ceil(reach / min(along, across)))
         round_it = block_about(np.zeros(1), [self.radius], across).grown(cells).points()[:, 0]
         axes = [centre + round_it for centre in base]
         axes[axis] = base[axis] + along * (np.arange(-cells, layers + cells) + 0.5)
@@ -259,10 +241,6 @@ class Filled(Turnable):
     """A body of fluid that fills a solid shape. The particles are packed, unless the surface follows cells of the
     lattice that starts at the lower corner of the body's box."""
 
-    @abstractmethod
-    def shape_about(self) -> tuple[Solid, Points]:
-        """Return the unrotated shape with its centroid at the origin, and the centroid (d,) that its keys imply [m]."""
-
     def body(self) -> Placed:
         shape, middle = self.shape_about()
         return Placed(shape, middle, rotation_matrix(self.rotation or (0.0,) * (2 * len(middle) - 3)))
@@ -272,9 +250,6 @@ class Filled(Turnable):
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
         return self.body().distance_up_to(points, reach)
-
-    def volume(self, spacing: float) -> float:
-        return self.shape_about()[0].moments().volume
 
     def particles(self, spacing: float) -> Points:
         return points_inside(self.body(), spacing)

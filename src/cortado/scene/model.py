@@ -12,7 +12,7 @@ from cortado.scene.appearance import LIQUIDS, Coloured, Picture, Render
 from cortado.scene.drain_tables import AnyDrain
 from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.fluids import AnyFluid, turned
-from cortado.scene.hinges import HingeTable
+from cortado.scene.links import HingeTable, SpringTable
 from cortado.scene.motions import Schedule
 from cortado.scene.packages import AnyForces
 from cortado.scene.parameters import PARAMETERS
@@ -21,19 +21,7 @@ from cortado.scene.shape_tables import AnyContainer, NoContainer
 from cortado.scene.solid_shapes import AnySolid
 from cortado.scene.solids import solids_of, thick
 from cortado.scene.solvers import AnySolver, what_suits
-from cortado.scene.springs import SpringTable
-from cortado.scene.tables import (
-    Colour,
-    Flag,
-    OneOf,
-    Several,
-    Table,
-    Text,
-    Vector,
-    count,
-    field_error,
-    quantity,
-)
+from cortado.scene.tables import Colour, Flag, OneOf, Several, Table, Text, Vector, count, field_error, quantity
 
 SHORTEST = 40.0
 """Smallest default regularisation of a yield stress [s]: unyielded fluid creeps at most 2.5 % of its depth per second.

@@ -13,7 +13,7 @@ from pydantic import Field, PrivateAttr, create_model, model_validator
 from cortado.discretise.solid import Mass
 from cortado.errors import Words
 from cortado.scene.courses import Columns, Interpolation, Knots, Ramp, Steady, path_of, values_in_file
-from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, ending
+from cortado.scene.parameters import PARAMETERS, Axis, Parameter, Range, Role, ending, of_part
 from cortado.scene.shape_tables import File
 from cortado.scene.solids import SolidTable
 from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error, quantity, usable_file
@@ -255,10 +255,8 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     size = {"role": Role.STATE, "range": Range.POSITIVE, "change": lambda source, value: 0.2 * np.abs(value)}
     steps: dict[str, Any] = {"axis": Axis.STEP, "moment": 1.0, "grows": True}
 
-    def made(of: Callable[[str], str], unit: str, meaning: str, value: Any, **more: Any) -> Parameter:
-        begun, axis = np.asarray(value, dtype=np.float64), more.pop("axis", Axis.SCALAR)
-        components = (lambda dimension, phases: dimension) if begun.ndim else None
-        return Parameter(of(name), unit, meaning, axis, lambda source: begun, components=components, **more)
+    def made(of: Callable[[str], str], *told: Any, **more: Any) -> Parameter:
+        return of_part(of(name), *told, **more)
 
     rotation = unturned if solid.rotation is None else np.reshape(solid.rotation, unturned.shape)
     spin = unturned if solid.angular_velocity is None else np.reshape(solid.angular_velocity, unturned.shape)

@@ -17,18 +17,8 @@ from pydantic_core import CoreSchema
 
 from cortado.errors import ComputationError, CortadoError, InputError, SceneError, Words, shown
 from cortado.scene.parameters import PARAMETERS, Parameter
-from cortado.scene.tables import (
-    MISSING,
-    FieldPath,
-    Flag,
-    Table,
-    Text,
-    count,
-    field_error,
-    quantity,
-    wanted,
-    without_numpy,
-)
+from cortado.scene.schema_words import wanted
+from cortado.scene.tables import MISSING, FieldPath, Flag, Table, Text, count, field_error, quantity, without_numpy
 
 GUARDED = "_guarded_by_cortado"
 ABSENT = object()

@@ -3,7 +3,7 @@
 n is the number of fluid particles, in the order of the scene; d is the scene's dimension.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,15 +105,15 @@ class Tilt:
         return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, derivative)
 
 
-class Known(Mapping[str, Parameter]):
+class Known(dict[str, Parameter]):
     """Parameters by name: the registry's, and those of forces and a solver. Two tables are equal only if identical."""
 
-    __eq__, __hash__ = object.__eq__, object.__hash__
+    __eq__, __hash__ = object.__eq__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
         """Add the parameters ``own`` of forces and a solver, each with its owner in words; `TIME` may occur several
         times. Raises `InputError` if two parameters share a name, or a name of kernel arguments."""
-        self._by_name = dict(BY_NAME)
+        super().__init__(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
         for parameter, whose in dict(own).items():
             name = parameter.name
@@ -123,7 +123,7 @@ class Known(Mapping[str, Parameter]):
                     f"have its own: give {whose.replace('a ', 'the ')} another name."
                 )
             arguments[argument(name)] = name
-            self._by_name[name] = parameter
+            self[name] = parameter
         self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
         """Names of the parameters on which steps depend."""
@@ -135,15 +135,6 @@ class Known(Mapping[str, Parameter]):
         self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
         """Alternative parameters, each with the name of the parameter that it replaces."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
-
-    def __getitem__(self, name: str) -> Parameter:
-        return self._by_name[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._by_name)
-
-    def __len__(self) -> int:
-        return len(self._by_name)
 
     def has_rows(self, name: str, value: Any) -> bool:
         """Test whether a value has an axis of time: one row for each step or knot."""
@@ -216,10 +207,12 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
         raise InputError(f"{what} {name} is given, but must be left out, as the scene {parameter.absent}.")
 
 
-def require_points(points: object) -> None:
-    if not isinstance(points, Sequence) or isinstance(points, (str, bytes)) or not points:
+def require_points(points: Any, are_read: bool = True) -> None:
+    """Raise `InputError` for anything but tables of parameters; the entries of an iterable are not read if told so."""
+    is_fit = isinstance(points, Sequence) and len(points) > 0 if are_read else isinstance(points, Iterable)
+    if not is_fit or isinstance(points, (str, bytes, Mapping)):
         raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")
-    for point in points:
+    for point in points if are_read else ():
         require_table("a point", point, "{'gravity': value}")
 
 

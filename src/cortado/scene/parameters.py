@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from math import inf
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -113,7 +114,13 @@ def _vector(dimension: int, phases: int) -> int:
     return dimension
 
 
-def _spacing(source: Source, value: Any = None) -> float:
+def of_part(name: str, unit: str, meaning: str, value: Any, axis: Axis = Axis.SCALAR, **more: Any) -> Parameter:
+    """Build the parameter of a part of a scene, such as a solid, whose value is a number or a vector (d,)."""
+    own = np.asarray(value, dtype=np.float64)
+    return Parameter(name, unit, meaning, axis, lambda source: own, components=_vector if own.ndim else None, **more)
+
+
+def spacing_of(source: Source, value: Any = None) -> float:
     return source.scene.discretisation.spacing
 
 
@@ -122,7 +129,7 @@ def _size_of_gravity(source: Source, value: Any = None) -> float:
 
 
 def _speed_of_fall(source: Source, value: Any) -> float:
-    height = float(np.ptp(source.positions, axis=0).max()) + _spacing(source)
+    height = float(np.ptp(source.positions, axis=0).max()) + spacing_of(source)
     return float(np.sqrt(_size_of_gravity(source) * height))
 
 
@@ -134,8 +141,22 @@ def _diffuses(source: Source, values: Mapping[str, NDArray]) -> bool:
     return bool(values["mobility"] > 0.0)
 
 
-def _of_phases(name: str) -> Callable[[Source], list[Any]]:
-    return lambda source: [getattr(phase, name) for phase in source.scene.phase]
+def _of_particles(name: str, unit: str, meaning: str, value: Callable[[Source], Any], **more: Any) -> Parameter:
+    """Build a parameter of the first state of particles, by default a vector."""
+    more = {"components": _vector, "role": Role.STATE, **more}
+    return Parameter(name, unit, meaning, Axis.PARTICLE, value, **more)
+
+
+def _of_phases(name: str, unit: str, meaning: str, key: str = "", **more: Any) -> Parameter:
+    """Build the parameter of a key of phases, by default of the same name."""
+    of_each = attrgetter(key or name)
+    return Parameter(name, unit, meaning, Axis.PHASE, lambda s: list(map(of_each, s.scene.phase)), **more)
+
+
+def _of_mixture(name: str, unit: str, meaning: str, value: Callable[[Source], Any], allowed: Range) -> Parameter:
+    """Build a parameter of the diffusion between phases."""
+    own: Any = {"acts": _diffuses, "present": _has_several_phases, "absent": "has only one phase", "range": allowed}
+    return Parameter(name, unit, meaning, Axis.SCALAR, value, **own)
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
@@ -192,52 +213,25 @@ PARAMETERS = (
         present=lambda scene: any(scene.forces.gravity),
         absent="has no gravity to lean",
     ),
-    Parameter(
-        "initial_positions",
-        "m",
-        "where particles are at the start",
-        Axis.PARTICLE,
-        lambda s: s.positions,
-        components=_vector,
-        role=Role.STATE,
-        change=_spacing,
+    _of_particles(
+        "initial_positions", "m", "where particles are at the start", lambda s: s.positions, change=spacing_of
     ),
-    Parameter(
-        "initial_velocities",
-        "m/s",
-        "how fast they are",
-        Axis.PARTICLE,
-        lambda s: s.velocities,
-        components=_vector,
-        role=Role.STATE,
-        change=_speed_of_fall,
-    ),
-    Parameter(
+    _of_particles("initial_velocities", "m/s", "how fast they are", lambda s: s.velocities, change=_speed_of_fall),
+    _of_particles(
         "mass_fractions",
         "",
         "what they are made of at the start, where there are several phases",
-        Axis.PARTICLE,
         lambda s: s.mass_fractions,
         components=lambda dimension, phases: phases,
-        role=Role.STATE,
         range=Range.FRACTIONS,
         change=lambda source, value: 0.02,
         acts=lambda source, values: _has_several_phases(source.scene),
     ),
-    Parameter(
-        "rest_density",
-        "kg/m³",
-        "density of the fluid at rest",
-        Axis.PHASE,
-        _of_phases("rest_density"),
-        range=Range.POSITIVE,
-    ),
-    Parameter(
+    _of_phases("rest_density", "kg/m³", "density of the fluid at rest", range=Range.POSITIVE),
+    _of_phases(
         "viscosity",
         "Pa s",
         "dynamic viscosity",
-        Axis.PHASE,
-        _of_phases("viscosity"),
         range=Range.NOT_NEGATIVE,
         present=lambda scene: scene.forces.viscosity != "none",
         absent='has viscosity = "none" in [forces]',
@@ -254,34 +248,25 @@ PARAMETERS = (
         present=lambda scene: not scene.solver.chooses,
         absent='chooses its time steps, by solver.time_step = "auto", and derivatives hold them constant',
     ),
-    Parameter(
+    _of_mixture(
         "mobility",
         "m²/s",
         "how fast phases diffuse into one another",
-        Axis.SCALAR,
         lambda s: s.scene.mixture.mobility,
-        range=Range.NOT_NEGATIVE,
-        acts=_diffuses,
-        present=_has_several_phases,
-        absent="has only one phase",
+        Range.NOT_NEGATIVE,
     ),
-    Parameter(
+    _of_mixture(
         "interface_width",
         "m",
         "width of the interface between phases",
-        Axis.SCALAR,
-        lambda s: s.scene.mixture.width(s.scene.discretisation.spacing),
-        range=Range.POSITIVE,
-        acts=_diffuses,
-        present=_has_several_phases,
-        absent="has only one phase",
+        lambda s: s.scene.mixture.width(spacing_of(s)),
+        Range.POSITIVE,
     ),
-    Parameter(
+    _of_phases(
         "colours",
         "",
         "red, green and blue of the phases, linear, from 0 to 1; for losses of images",
-        Axis.PHASE,
-        _of_phases("colour"),
+        "colour",
         components=lambda dimension, phases: 3,
         role=Role.LOSS,
         change=lambda source, value: 1.0,

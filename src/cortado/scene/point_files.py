@@ -13,7 +13,6 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from numpy.lib import format as npy
 
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, Words, shown
-from cortado.files.disk import reason, regular_file
+from cortado.files.disk import cached_by_file, reason
 
 MOST_POINTS = 10_000_000
 REFUSED = 3
@@ -137,17 +136,12 @@ def read_points(path: str, dimension: int) -> Points:
     """Read points (n, d) [m] from a file, read-only; raise `InputError` with the file's name."""
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
-    try:
-        stat = regular_file(path, MOST_POINT_BYTES)
-    except OSError as problem:
-        raise InputError(f"{path!r} cannot be opened ({reason(problem)}).") from None
-    return _read(path, dimension, stat.st_mtime_ns, stat.st_size)
+    return _read(path, dimension)
 
 
-@lru_cache(maxsize=4)
-def _read(path: str, dimension: int, changed: int, size: int) -> Points:
-    """Read a file; its modification time and size make the cache notice a new version."""
-    array = _read_npy(path, size, dimension) if Path(path).suffix == ".npy" else _read_apart(path, size)
+@cached_by_file(4, MOST_POINT_BYTES)
+def _read(path: str, dimension: int) -> Points:
+    array = _read_npy(path, dimension) if Path(path).suffix == ".npy" else _read_apart(path)
     if array.ndim == 2 and array.shape[1] == 3 and dimension == 2 and Path(path).suffix in READERS:
         array = array[:, :2]  # VTK knows no plane
     _check_form(path, array.shape, array.dtype, dimension)
@@ -165,7 +159,7 @@ def _check_form(path: str, shape: tuple[int, ...], dtype: np.dtype[Any], dimensi
         raise InputError(f"{path!r} holds {shape[0]} points, but must hold at most {MOST_POINTS}.")
 
 
-def _read_npy(path: str, size: int, dimension: int) -> Any:
+def _read_npy(path: str, dimension: int) -> Any:
     """Read the array of a NumPy file, after a check that its header agrees with the size of the file."""
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     try:
@@ -173,7 +167,7 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
             warnings.simplefilter("ignore")  # the header is Python, which may warn of what it finds
             shape, by_columns, dtype = headers[npy.read_magic(file)](file)
             _check_form(path, shape, dtype, dimension)
-            wanted = file.tell() + math.prod(shape) * dtype.itemsize
+            wanted, size = file.tell() + math.prod(shape) * dtype.itemsize, os.fstat(file.fileno()).st_size
             if wanted != size:
                 found = f"says that it holds {dtype} of shape {shape}, which takes {wanted} bytes"
                 raise InputError(f"{path!r} {found}, but it has {size}.")
@@ -184,8 +178,8 @@ def _read_npy(path: str, size: int, dimension: int) -> Any:
         raise InputError(f"{path!r} is no array that NumPy can read ({shown(Words(reason(problem)))}).") from None
 
 
-def _read_apart(path: str, size: int) -> Any:
-    limit = SECONDS + size / BYTES_PER_SECOND
+def _read_apart(path: str) -> Any:
+    limit = SECONDS + os.path.getsize(path) / BYTES_PER_SECOND
     command = [sys.executable, "-P", "-m", "cortado.scene.point_files", path]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each would reserve memory
     environment = {**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

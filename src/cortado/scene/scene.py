@@ -358,27 +358,22 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
     parts = key.replace("[", ".").replace("]", "").split(".")
     if len(parts) > MOST_PARTS:
         raise _too_deep(file, key)
-    field = key if len(key) <= LONGEST else shown(key)
     place: Any = data
     for depth, part in enumerate(parts):
-        last = depth == len(parts) - 1
-        index: str | int = part
-        if isinstance(place, list):
-            found = _entry(place, part)
-            if found is None:
-                entry = ".".join(parts[: depth + 1])
-                raise SceneError(file, entry if len(entry) <= LONGEST else shown(entry), part, _entries(place))
-            index = found
-        elif not isinstance(place, dict):
-            raise SceneError(
-                file, field, sentence=f"cannot be set, as {'.'.join(parts[:depth])[:LONGEST]} is not a table."
-            )
-        elif not last:
-            place.setdefault(part, {})
-        if last:
+        index: Any = _entry(place, part) if isinstance(place, list) else part
+        if index is None:
+            raise SceneError(file, _short(".".join(parts[: depth + 1])), part, _entries(place))
+        if not isinstance(place, (dict, list)):
+            sentence = f"cannot be set, as {'.'.join(parts[:depth])[:LONGEST]} is not a table."
+            raise SceneError(file, _short(key), sentence=sentence)
+        if depth == len(parts) - 1:
             place[index] = _value(text.strip())
         else:
-            place = place[index]
+            place = place[index] if isinstance(place, list) else place.setdefault(part, {})
+
+
+def _short(key: str) -> str:
+    return key if len(key) <= LONGEST else shown(key)
 
 
 def _entry(tables: list[Any], part: str) -> int | None:

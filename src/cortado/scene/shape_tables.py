@@ -1,6 +1,5 @@
 """Tables of shapes that solids and bodies of fluid share, and tables of containers with their walls."""
 
-from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -91,15 +90,19 @@ class CylinderShape(Table):
     axis: Literal["x", "y", "z"] = "y"
     """Axis of space along which the cylinder stands, before a rotation if the table has one."""
 
+    @property
+    def along(self) -> int:
+        """Return the index of the axis."""
+        return INDEX_OF_AXIS[self.axis]
+
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:
             raise field_error((*path, "shape"), "cylinder", f"{self.instead} in 2-D")
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        along = INDEX_OF_AXIS[self.axis]
-        middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[along]
-        return Revolved(Box(np.array([self.radius, 0.5 * self.height])), along), middle
+        middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[self.along]
+        return Revolved(Box(np.array([self.radius, 0.5 * self.height])), self.along), middle
 
 
 class PolygonShape(Table):
@@ -194,40 +197,40 @@ def _crossing(corners: Points) -> tuple[int, int] | None:
 
 
 class Container(Table):
-    """A container of the fluid, of any shape."""
+    """A container of the fluid, of any shape; without other methods it is free space."""
 
     sticks: ClassVar[Any] = False
     finish: ClassVar[Any] = None
     """`Finish` of the walls; None without a material or colour."""
 
-    @abstractmethod
     def extent(self) -> tuple[Points, Points] | None:
         """Return the lower and the upper corner (d,) [m] of the box around the container; None without a container."""
+        return None
 
-    @abstractmethod
     def region(self, dimension: int) -> Region:
         """Return the region for fluid, within one period."""
+        return Region.everywhere(dimension)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
         """Return a mask (n,) of the points (n, d) [m] that are at most ``tolerance`` [m] outside."""
         return self.region(points.shape[1]).contains(points, tolerance)
 
-    @abstractmethod
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         """Return one layer (b, d) of wall particles [m], ``depth`` [m] outside of the container."""
+        return np.zeros((0, dimension))
 
-    @abstractmethod
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
         """Return places for fluid less than ``reach`` [m] from a wall."""
+        return Places.upright(np.zeros((0, dimension)))
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
         """Return a shorter container with equal weights of walls, for a spacing and a support [m]. Also return a
         function from points (b, d) [m] on these walls to points of equal weight on the shorter walls."""
         return self, lambda points: points
 
-    @abstractmethod
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
         """Return the solids that form the container's walls, extended by ``reach`` [m] beyond the ends of a period."""
+        return ()
 
     def wall_count(self, spacing: float) -> float:
         ends = self.extent()
@@ -250,21 +253,6 @@ class NoContainer(Container):
     """Free space without a container."""
 
     shape: Literal["none"] = "none"
-
-    def extent(self) -> None:
-        return None
-
-    def region(self, dimension: int) -> Region:
-        return Region.everywhere(dimension)
-
-    def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        return ()
-
-    def walls(self, dimension: int, spacing: float, depth: float) -> Points:
-        return np.zeros((0, dimension))
-
-    def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        return Places.upright(np.zeros((0, dimension)))
 
 
 class Walled(Table):
@@ -340,13 +328,13 @@ class CylinderContainer(Walled, CylinderShape, Container):
     """Whether the cup is closed at the top; without a lid, fluid may rise above the rim."""
 
     def extent(self) -> tuple[Points, Points]:
-        axis = INDEX_OF_AXIS[self.axis]
+        axis = self.along
         lower, upper = np.array(self.base) - self.radius, np.array(self.base) + self.radius
         lower[axis], upper[axis] = self.base[axis], self.base[axis] + self.height
         return lower, upper
 
     def region(self, dimension: int) -> Region:
-        axis = INDEX_OF_AXIS[self.axis]
+        axis = self.along
         closed = Region.cylinder(np.array(self.base), self.radius, self.height, axis)
         if self.lid:
             return closed
@@ -354,17 +342,17 @@ class CylinderContainer(Walled, CylinderShape, Container):
         return replace(closed, upper=np.where(is_along, np.inf, closed.upper), rim=float(closed.upper[axis]))
 
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        axis, height = INDEX_OF_AXIS[self.axis], self.height if self.lid else 2.0 * self.height
+        axis, height = self.along, self.height if self.lid else 2.0 * self.height
         profile = Box(np.array([self.radius, 0.5 * height]))
         middle = np.array(self.base) + 0.5 * height * np.eye(3)[axis]
         return (Hollow(Placed(Revolved(profile, axis), middle, np.eye(3))),)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
         upright = cup_walls(self.radius, self.height, self.lid, spacing, depth)
-        return self.base + np.roll(upright, INDEX_OF_AXIS[self.axis] + 1, axis=1)
+        return self.base + np.roll(upright, self.along + 1, axis=1)
 
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        upright, turn = cup_places(self.radius, self.height, self.lid, spacing, reach), INDEX_OF_AXIS[self.axis] + 1
+        upright, turn = cup_places(self.radius, self.height, self.lid, spacing, reach), self.along + 1
         return Places(self.base + np.roll(upright.points, turn, axis=1), np.roll(upright.axes, turn, axis=2))
 
 

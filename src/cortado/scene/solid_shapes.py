@@ -1,28 +1,19 @@
 """Shapes of solids."""
 
-from functools import lru_cache
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from cortado.arrays import unit
-from cortado.discretise.mesh_files import triangles_in_file
+from cortado.discretise.mesh_files import MOST_BYTES, triangles_in_file
 from cortado.discretise.primitives import HalfSpace, Polygon, Revolved, Round
 from cortado.discretise.shapes import Points
 from cortado.discretise.sheet import Sheet, Thickened
 from cortado.discretise.solid import Solid
 from cortado.errors import InputError, Words
-from cortado.scene.shape_tables import (
-    INDEX_OF_AXIS,
-    BoxShape,
-    Container,
-    CylinderShape,
-    File,
-    MeshShape,
-    PolygonShape,
-    SphereShape,
-)
+from cortado.files.disk import cached_by_file
+from cortado.scene.shape_tables import BoxShape, Container, CylinderShape, File, MeshShape, PolygonShape, SphereShape
 from cortado.scene.solids import SolidTable
 from cortado.scene.tables import MISSING, FieldPath, Length, Vector, field_error, quantity, usable_file
 
@@ -74,9 +65,6 @@ class PlaneSolid(SolidTable):
         position, unit = np.array(self.position), self._unit()
         lower, upper = np.array(self._ends or (position - 1.0, position + 1.0))
         return HalfSpace(unit, 0.0, lower - position, upper - position), position
-
-    def thinnest(self, spacing: float) -> float:
-        return np.inf
 
     def _unit(self) -> Points:
         return unit(np.array(self.normal))
@@ -161,13 +149,12 @@ class CupSolid(SolidTable):
         return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
-        dimension, middle = len(self.base), self._middle()
+        dimension, middle, along = len(self.base), self._middle(), "xyz".index(self.axis)
         outside, rim, bottom = self.radius + self.thickness, self.height - middle, self.thickness - middle
         half = [(outside, -middle), (outside, rim), (self.radius, rim), (self.radius, bottom)]
         profile = Polygon(np.array([*half, *((-x, y) for x, y in half[::-1])]))
-        up = np.eye(dimension)[INDEX_OF_AXIS[self.axis]]
-        shape = profile if dimension == 2 else Revolved(profile, INDEX_OF_AXIS[self.axis])
-        return shape, np.array(self.base) + middle * up
+        shape = profile if dimension == 2 else Revolved(profile, along)
+        return shape, np.array(self.base) + middle * np.eye(dimension)[along]
 
     def thinnest(self, spacing: float) -> float:
         return self.thickness
@@ -255,9 +242,6 @@ class SheetSolid(SolidTable):
         assert isinstance(about, Sheet)
         return Thickened(about, 0.1 * spacing)
 
-    def thinnest(self, spacing: float) -> float:
-        return np.inf
-
     def _check_corners(self, dimension: int, path: FieldPath) -> None:
         assert self.corners is not None
         for index, corner in enumerate(self.corners):
@@ -280,7 +264,7 @@ class SheetSolid(SolidTable):
                 raise field_error((*path, "corners"), self.corners, wanted)
 
 
-@lru_cache(maxsize=8)
+@cached_by_file(8, MOST_BYTES)
 def _sheet_in(path: str) -> Sheet:
     """Read the surface in a file of triangles, in the file's unit of length; raise `InputError`."""
     vertices, corners = triangles_in_file(path)

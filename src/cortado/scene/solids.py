@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -25,7 +24,6 @@ from cortado.scene.tables import (
     Text,
     Turning,
     check_name,
-    check_turn,
     quantity,
     rotation_matrix,
 )
@@ -161,10 +159,10 @@ class SolidTable(Coloured):
         grown = {name: _times(scale, getattr(self, name)) for name in self.measures}
         return self.model_copy(update={**grown, "position": tuple(self.centroid().tolist())})
 
-    @abstractmethod
     def thinnest(self, spacing: float) -> float:
-        """Return the thickness of the thinnest part [m]; infinite for a mesh without sheets thinner than a few
-        spacings."""
+        """Return the thickness of the thinnest part [m]; infinite for planes and sheets, and for a mesh without sheets
+        thinner than a few spacings."""
+        return np.inf
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
         """Return the table, found at ``path``, with unbounded shapes cut to the container."""
@@ -193,8 +191,7 @@ class SolidTable(Coloured):
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("position", "velocity", "surface_velocity", "centre_of_mass"), dimension, path)
-        for name in ("rotation", "angular_velocity", "gyration_radius"):
-            check_turn((*path, name), getattr(self, name), dimension)
+        self._check_turns(("rotation", "angular_velocity", "gyration_radius"), dimension, path)
         check_motion(self, dimension, path)
         return super().in_dimension(dimension, path)
 
@@ -208,7 +205,6 @@ def check_free_body(path: FieldPath, name: str, tables: Sequence[SolidTable]) ->
     check_name(path, name, free, "a free body", 'of a solid whose motion is "free"')
 
 
-@lru_cache(maxsize=8)
 def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:
     return tuple(table.solid() for table in tables)
 

@@ -8,13 +8,13 @@ import numpy as np
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import pairwise_rate, smoothing_kernel, stress_rate
 from cortado.scene.drain_tables import flow_name, sink_limit
+from cortado.scene.links import spring_limit
 from cortado.scene.model import SceneTables
 from cortado.scene.motions import free, greatest_speed, moving, position_name, rotation_name, scale_name, told
 from cortado.scene.parameter_values import Arrays, Tilt
 from cortado.scene.parameters import PARAMETERS
 from cortado.scene.solids import SolidTable, solids_of
 from cortado.scene.solvers import ProjectionSolver
-from cortado.scene.springs import spring_limit
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
@@ -181,7 +181,7 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
         own["the speed of solids"] = SOLID_STEP * scene.discretisation.spacing / fastest
-    if scene.spring or any(hinge.turns for hinge in scene.hinge):
+    if scene.spring or any(hinge.turned_by for hinge in scene.hinge):
         own["springs"] = spring_limit(scene, values)
     if any(body.sticks for body in free(scene.solid)) and (greatest := _kinematic(scene, values)) > 0.0:
         own["friction"] = FRICTION_STEP * scene.discretisation.spacing**2 / greatest

@@ -132,23 +132,16 @@ def _in_a_list(value: Any) -> Any:
     return [value] if isinstance(value, (int, float)) else value
 
 
-Few = Annotated[tuple[Item, ...], Field(min_length=1, max_length=3, fail_fast=True), BeforeValidator(_in_a_list)]
-"""One number in 2-D, or a list of three in 3-D."""
+def _few(most: int) -> Any:
+    """Describe a field with one number in 2-D, and a list in 3-D."""
+    return Field(min_length=1, max_length=most, fail_fast=True, json_schema_extra={"maxItemsIn2D": 1})
+
+
+Few = Annotated[tuple[Item, ...], _few(3), BeforeValidator(_in_a_list)]
 Rotation = Few[Angle]
 Turning = Few[Annotated[float, quantity("rad/s")]]
 Radii = Few[Annotated[float, quantity("m", gt=0.0)]]
-Inertia = Annotated[
-    tuple[Annotated[float, quantity("kg m2")], ...],
-    Field(min_length=1, max_length=9, fail_fast=True),
-    BeforeValidator(_in_a_list),
-]
-
-
-def check_turn(path: FieldPath, value: tuple[float, ...] | None, dimension: int) -> None:
-    """Check that a rotation or an angular velocity has 1 component in 2-D and 3 in 3-D; None is allowed."""
-    if value is not None and len(value) != 2 * dimension - 3:
-        wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
-        raise field_error(path, value, wanted)
+Inertia = Annotated[tuple[Annotated[float, quantity("kg m2")], ...], _few(9), BeforeValidator(_in_a_list)]
 
 
 def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
@@ -372,6 +365,14 @@ class Table(BaseModel, metaclass=Documented):
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
                 wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
+                raise field_error((*path, name), value, wanted)
+
+    def _check_turns(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
+        """Raise a `field_error` if a rotation or an angular velocity among these fields does not have 1 component in
+        2-D and 3 in 3-D."""
+        for name in names:
+            if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
+                wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
                 raise field_error((*path, name), value, wanted)
 
 

@@ -23,7 +23,7 @@ from cortado.particles.state import Layout, padded
 from cortado.scene.discrete_scene import DiscreteScene, mirrors_of
 from cortado.scene.drain_tables import drain_parameters
 from cortado.scene.emitter_table import emitter_parameters
-from cortado.scene.hinges import Hold, joints_of
+from cortado.scene.links import Hold, ends_of, joints_of, spring_parameters
 from cortado.scene.motions import mass_of_one, motion_parameters, moving, solid_frames, wall_numbers, weight_name
 from cortado.scene.parameter_values import REGISTRY, Known, checked_value
 from cortado.scene.parameters import PARAMETERS, Parameter, Source
@@ -31,7 +31,6 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import PackageSolver, SolverTable
-from cortado.scene.springs import ends_of, spring_parameters
 from cortado.solvers.contacts import Contacts, Touching
 from cortado.solvers.obstacles import (
     FINE,

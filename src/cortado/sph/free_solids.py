@@ -31,7 +31,7 @@ from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, State, StateField
-from cortado.scene.hinges import Hold, Joint, inertia_about
+from cortado.scene.links import Hold, Joint, inertia_about
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
 from cortado.sph.moving_solids import free_module, hold_functions, hold_numbers, rotations

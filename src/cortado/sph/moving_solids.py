@@ -37,7 +37,7 @@ from cortado.particles.moving_walls import MovingWalls, turn_functions
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, Parameters, State, StateField
-from cortado.scene.hinges import Hold
+from cortado.scene.links import Hold
 from cortado.scene.motions import displacement_name, position_name, rotation_name, scale_name, turn_name
 from cortado.scene.parameters import Axis
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents, integration_module

@@ -30,8 +30,7 @@ from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.particles.moving_walls import resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, zeros
-from cortado.scene.hinges import Joint
-from cortado.scene.springs import Ends
+from cortado.scene.links import Ends, Joint
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 

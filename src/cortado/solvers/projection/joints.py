@@ -10,7 +10,7 @@ import warp as wp
 
 from cortado.device.launching import Named
 from cortado.particles.state import Layout, zeros
-from cortado.scene.hinges import Joint
+from cortado.scene.links import Joint
 from cortado.solvers.projection.joint_kernels import ROW, joint_kernels
 from cortado.sph.free_solids import FreeSolidsPart
 from cortado.sph.parts import Adjoints, StepContext, Tangents
