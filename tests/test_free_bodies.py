@@ -350,6 +350,7 @@ def test_a_file_of_frames_tells_where_bodies_are(tmp_path):
     run = Simulation(touching()).run(6, record_every=2)
     run.save(tmp_path / "run.vtkhdf")
     read = type(run).load(tmp_path / "run.vtkhdf")
+    assert [*run.solids] == [solid.name for solid in touching().solid if solid.name in read.solids]
     assert read.solids.keys() == run.solids.keys() == {"raft", "ball", "arm"}
     for name, motion in run.solids.items():
         assert np.array_equal(read.solids[name].positions, motion.positions)

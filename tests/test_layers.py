@@ -122,12 +122,13 @@ class Refuse:
             raise AssertionError(f"{name} is imported")
 
 sys.meta_path.insert(0, Refuse())
+from cortado.errors import ExtraMissingError, LibraryMissingError
 sys.modules["torch"] = None  # which takes longer to import than all else
 for module in {core}:
     try:
         importlib.import_module(f"cortado.{module}")
-    except ImportError as missing:  # of a package that Cortado can do without, such as JAX
-        assert not str(missing.name).startswith("cortado."), missing
+    except (ModuleNotFoundError, ExtraMissingError, LibraryMissingError) as missing:  # such as JAX
+        assert not str(missing.name).startswith("cortado"), missing
 import cortado
 from scenes import plane
 simulation = cortado.Simulation(plane(), precision="float64")

@@ -1,14 +1,9 @@
-"""What worker processes are given to do, in a module that they can import."""
+"""What worker processes are given to do, in a module that they can import. Their kernels have the flags of users."""
 
 import os
 import time
 
 import numpy as np
-
-from compiling_notice import FLAGS, compile_fast
-
-compile_fast(FLAGS)
-"""So that kernels of workers are those of the tests."""
 
 
 class FarFromHome:

@@ -209,7 +209,7 @@ class Stepper:
         """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist.
 
         ``along``: further parameters in directions of `jvp`. Only the mobility must be named, because fluid with
-        mobility 0 is computed without diffusion. Parameters may be on the device, as for `advance`.
+        mobility 0 is computed without diffusion. Parameters may be on the device, and ``place`` is as in `advance`.
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)}, place)

@@ -21,6 +21,7 @@ from cortado.runs.quantity_values import QuantityEvaluator
 from cortado.runs.sensor import Readings, SensorLog
 from cortado.runs.step_sums import SIX, ChunkSums, StepQuantities
 from cortado.runs.trajectory import Trajectory
+from cortado.scene.motions import moving
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Axis
 from cortado.scene.restart import Clock
@@ -154,7 +155,7 @@ def recorded(
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
-        clock = rollout.clocks[number]
+        clock, motions = rollout.clocks[number], SolidMotions.of(own, scene.dimension)
         return Trajectory(
             times=clock.times(steps[kept], float(rollout.time_steps[number])),
             steps=clock.steps + steps[kept],
@@ -163,7 +164,7 @@ def recorded(
             diagnostics={name: column[at] for name, column in rollout.diagnostics.items()},
             mass_fractions=own.pop("mass_fractions", None),
             others=own,
-            solids=SolidMotions.of(own, scene.dimension),
+            solids=SolidMotions({one.name: motions[one.name] for one in moving(scene.solid) if one.name in motions}),
             scene=scene,
             constants={name: array[at[1:]] for name, array in constants.items()},
             substeps=rollout.substeps,
