@@ -27,7 +27,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from re import sub
-from types import MappingProxyType
 from typing import Any
 
 import warp as wp
@@ -242,7 +241,7 @@ def pointwise_kernels(
     modules: Sequence[Any],
     make: Callable[[Any], Callable[..., Any]],
     results: Sequence[str],
-    replaced: Mapping[str, str] = MappingProxyType({}),
+    replaced: Mapping[str, str] | None = None,
     **names: Any,
 ) -> Kernels:
     """Make forward, tangent and adjoint kernels, in the three Warp ``modules``, of the function that ``make(module)``
@@ -255,7 +254,7 @@ def pointwise_kernels(
     """
     functions = [make(module) for module in modules]
     terms = [Term.of(function) for function in functions]
-    of = _Pointwise(precision, terms[0], results, Kinds(replaced, **names), modules[0].options["enable_backward"])
+    of = _Pointwise(precision, terms[0], results, Kinds(replaced or {}, **names), modules[0].options["enable_backward"])
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())
     made = []
     for k, ((name, types, lines), term, module) in enumerate(zip(texts, terms, modules, strict=True)):
