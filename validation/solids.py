@@ -145,7 +145,7 @@ def cases(device: str) -> dict[str, Callable[[], object]]:
         "settling-disc, 24 across": partial(settling_disc, 24, 4.34e-5, 0.15, device),
         "settling-ball, b/a = 2, 12 across": partial(settling_ball, 12, 2.0, 1.73e-4, 0.15, device, 0.6),
         "settling-ball, b/a = 2, 24 across": partial(settling_ball, 24, 2.0, 4.34e-5, 0.15, device, 0.6),
-        "settling-ball, b/a = 4, 12 across": partial(settling_ball, 12, 4.0, 1.73e-4, 0.15, device),
+        "settling-ball, b/a = 4, 12 across": partial(settling_ball, 12, 4.0, 1.73e-4, 0.15, device, 0.6),
         "floating-box, 16 particles long": lambda: floating_box(16),
         "floating-box, 32 particles long": lambda: floating_box(32),
         **{
