@@ -7,7 +7,6 @@ import shutil
 from collections import Counter
 from functools import cache
 from importlib.util import find_spec
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from cortado.device.threads import CORES, usable_cores
 from cortado.discretise import packing
-from cortado.scene import tables
 from short import is_slow, seconds_of, short
 from skips import complaints, reason_of
 
@@ -32,17 +30,8 @@ gc.set_threshold(100_000, 20, 20)
 """Launches make so many small objects that looking for those in circles takes a tenth of the tests' time otherwise."""
 
 
-@cache
-def with_one_schema(model):
-    """In place of a model, the schema of which takes a tenth of a second to make."""
-    return SimpleNamespace(model_json_schema=cache(model.model_json_schema))
-
-
 packing._packed = cache(packing._packed.__wrapped__)
 """All results are kept, not the last few: the same scenes come back in other tests."""
-scene_error = tables._scene_error
-tables._scene_error = lambda error, model: scene_error(error, with_one_schema(model))
-"""Some thousand tables are refused in the tests."""
 
 os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
 """Each worker of pytest has its share of the cores: threads beyond it wait for each other. What several cores do is

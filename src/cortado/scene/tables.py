@@ -215,11 +215,12 @@ def field_name(path: FieldPath) -> str:
 
 def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     first = error.errors(include_url=False)[0]
-    schema, path = _schema_at(model.model_json_schema(), first["loc"])
+    whole = _schema_of(model)
+    schema, path = _schema_at(whole, first["loc"])
     if first["type"] == "scene":
         own = first["ctx"]["error"]
         path, sentence = [*path, *own.path], own.sentence
-        if own.found is UNKNOWN and (homes := _homes(model.model_json_schema(), path)):
+        if own.found is UNKNOWN and (homes := _homes(whole, path)):
             sentence = f"is not a key of {{table}}; did you mean {' or '.join(homes)}?"
         if sentence:
             sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
@@ -236,6 +237,11 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):
         words = f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size"
     return SceneError(None, field_name(path), found, words)
+
+
+@cache
+def _schema_of(model: type[BaseModel]) -> Schema:
+    return model.model_json_schema()
 
 
 def _homes(whole: Schema, path: FieldPath) -> list[str]:
