@@ -1,6 +1,6 @@
 """Cortado: a differentiable SPH fluid simulator with verified gradients.
 
-Begin, in Python::
+A first example::
 
     scene = cortado.Scene(
         dimension=2,
@@ -18,9 +18,9 @@ Begin, in Python::
     problem = cortado.Problem(simulation, 20, cortado.losses.SensorMatch(gauge, [0.31]))
     value, gradient = problem.value_and_gradient({"gravity": [0.5, -9.81], "viscosity": 1.0})
 
-``cortado new dam`` writes a scene file with comments, which ``cortado.Simulation("dam.toml")`` takes, and ``cortado
-schema`` prints all keys with their meanings. Names are imported when they are first used, so that ``import cortado`` is
-quick.
+The command ``cortado new dam`` writes a commented scene file, which ``cortado.Simulation("dam.toml")`` reads. The
+command ``cortado schema`` prints all keys with their meanings. Names are imported when they are first used, so ``import
+cortado`` is quick.
 """
 
 from cortado.lazy import getter

@@ -1,10 +1,9 @@
-"""Start the command ``cortado`` or ``python -m cortado``: signal handlers are set before large imports."""
+"""The entry point of ``cortado`` and ``python -m cortado``. Signal handlers are set before the large imports."""
 
 from cortado.files import terminal as interruption
 
 
 def main() -> None:
-    """Run the command line; always exits."""
     interruption.leave_at_once()
     from cortado.files.terminal import steady_streams
 

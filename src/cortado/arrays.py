@@ -1,4 +1,4 @@
-"""Convert numbers that users give to float64 arrays, and check arguments."""
+"""Convert numbers from users to float64 arrays, and check arguments."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -22,7 +22,7 @@ GREATEST_NUMBER = 10**18
 
 
 def as_number(value: Any) -> float | None:
-    """Return a finite number as a float; None for anything else, including a bool."""
+    """Return a finite number as a float, and None for any other value or a bool."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         return None
     try:
@@ -33,10 +33,9 @@ def as_number(value: Any) -> float | None:
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
-    """Return real numbers, lists or arrays of other libraries as float64, without copying float64.
+    """Convert real numbers, lists or arrays of other libraries to float64. Arrays of float64 are not copied.
 
-    Raise `InputError`, in a sentence that begins with ``what``, for complex numbers, text, bools and masked entries,
-    which NumPy would convert with a loss of information.
+    Raises `InputError` for complex numbers, text, bools and masked entries. The error message begins with ``what``.
     """
     try:
         array = np.asarray(value)
@@ -55,7 +54,7 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
-    """Return real numbers as float64; raise `InputError` for other types, and for float16."""
+    """Convert real numbers to float64. Raises `InputError` for other types and for float16."""
     kind = str(getattr(value, "dtype", ""))
     if kind.endswith("float16"):  # bfloat16 too
         raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
@@ -69,7 +68,7 @@ def read_only(what: str, value: Any) -> np.ndarray:
 
 
 def as_one_number(what: str, value: Any) -> float:
-    """Return one real number as a float; raise `InputError` for anything else."""
+    """Convert one real number to a float, or raise `InputError`."""
     array = as_numbers(what, value)
     if array.shape:
         raise InputError(f"{what} has shape {array.shape}, but must be one number.")
@@ -81,7 +80,7 @@ def is_whole(value: object) -> bool:
 
 
 def require_whole(what: str, value: object, least: int) -> None:
-    """Raise `InputError` unless a value is a whole number of at least ``least``."""
+    """Raise `InputError` unless ``value`` is a whole number of at least ``least``."""
     if not is_whole(value) or value < least:  # type: ignore[operator]
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
 
@@ -102,14 +101,14 @@ def whole_number(what: str, value: Any, least: int) -> int:
 
 
 def require_function(what: str, value: Any, *arguments: str) -> None:
-    """Raise `InputError` unless a value is None or callable with these ``arguments``."""
+    """Raise `InputError` unless ``value`` is None or a function that takes ``arguments``."""
     if value is not None:
         require_arguments(what, value, arguments, "; or leave it out")
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raise `InputError` unless ``function`` is callable with the ``wanted`` arguments, as far as Python can tell.
-    ``other`` names other accepted values."""
+    """Raise `InputError` if the signature of ``function`` lacks one of the arguments ``wanted``. The error message also
+    mentions the text ``other``."""
     if not callable(function) or isinstance(function, type):
         raise InputError(
             f"{what} is {shown(function)}, but must be a function of {', '.join(wanted) or 'nothing'}{other}."
@@ -132,7 +131,8 @@ def require_truth(what: str, value: object) -> None:
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raise `InputError`, in a sentence that ends with ``wanted``, unless a value is an object with these methods."""
+    """Raise `InputError` unless ``value`` is an object with the methods ``names``. The error message ends with
+    ``wanted``."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 
@@ -147,7 +147,7 @@ def check_steps(steps: int, least: int = 1) -> int:
 
 
 def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
-    """Return numbers of steps from 0 to ``most`` as a list; raise `InputError` for anything else."""
+    """Return step numbers as a list. Raises `InputError` unless all are whole numbers from 0 to ``most``."""
     if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
         raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
     found = [whole_number("a number of steps", step, 0) for step in steps]
@@ -167,14 +167,14 @@ def _is_real(value: Any) -> bool:
 
 
 def require_names(what: str, names: Any) -> list[Any]:
-    """Return several names as a list; raise `InputError` for a single string."""
+    """Return a sequence of names as a list, or raise `InputError` for a single string."""
     if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
         raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
     return list(names)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """Return a finite non-zero vector (d,) scaled to length 1, without underflow or overflow of its square."""
+    """Scale a finite non-zero vector (d,) to length 1, without overflow or underflow."""
     size = np.linalg.norm(vector)
     if not 0.0 < size < np.inf:
         vector = vector / np.abs(vector).max()

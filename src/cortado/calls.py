@@ -1,4 +1,4 @@
-"""Make public functions raise one clear sentence for wrong arguments, and make objects unchangeable (`fixed`)."""
+"""Give public functions clear error messages for wrong arguments, and make objects immutable."""
 
 import os
 import sys
@@ -28,14 +28,14 @@ _WORDS: dict[Any, str] = {
 
 
 def face(module: dict[str, Any]) -> Callable[[], list[str]]:
-    """Make the names in ``__all__`` of a module `public`, and return its ``__dir__``."""
+    """Apply `public` to the names in a module's ``__all__``, and return a function for the module's ``__dir__``."""
     names: list[str] = module["__all__"]
     module.update({name: public(module[name]) for name in names})
     return lambda: names
 
 
 def public(value: T) -> T:
-    """Apply `told` to a function, or to the public methods of a class; return anything else unchanged."""
+    """Wrap a function, or the public methods of a class, with `told`. Any other value is returned unchanged."""
     if not str(getattr(value, "__module__", "")).startswith("cortado"):
         return value
     made: Any = value
@@ -58,7 +58,7 @@ def public(value: T) -> T:
 
 @cache
 def told(function: F) -> F:
-    """Wrap a function so that wrong arguments raise `InputError` in a sentence instead of `TypeError`."""
+    """Wrap a function so that a call with wrong arguments raises `InputError` with a clear message."""
     if hasattr(function, "is_told"):
         return function
     takes = signature(function)
@@ -102,7 +102,7 @@ def _misfit(function: Any, bound: BoundArguments) -> str | None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Test if a value matches a type hint, as far as possible without consuming iterators."""
+    """Test whether a value matches a type hint. Iterators are not consumed."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
@@ -157,8 +157,8 @@ _OWN = "_made_with"
 
 
 def fixed(made: type[T]) -> type[T]:
-    """Decorate a class: after construction, setting or deleting public attributes raises `InputError`. A derived class
-    may add attributes, and methods may be assigned to an object."""
+    """Decorate a class so that setting or deleting public attributes after construction raises `InputError`. Derived
+    classes may add attributes."""
     begin: Callable[..., None] = told(made.__init__)
 
     @wraps(begin)
@@ -187,7 +187,7 @@ def fixed(made: type[T]) -> type[T]:
 
 
 class FixedDict(dict[Any, Any]):
-    """An unchangeable copy of a dict."""
+    """An immutable copy of a dict."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FixedDict, (dict(self),)
@@ -208,10 +208,10 @@ def keep_own(made: object, name: str) -> None:
 
 
 class Staying:
-    """A base class for objects with arrays on a device: pickling or copying them raises `InputError`."""
+    """A base class for objects with arrays on a device. Pickling or copying such an object raises `InputError`."""
 
     instead: ClassVar[str] = "but NumPy arrays of what it holds can"
-    """End of the error sentence: what can be pickled instead."""
+    """End of the error message, which names what can be pickled."""
 
     def __reduce__(self) -> NoReturn:
         name = type(self).__name__
@@ -220,7 +220,7 @@ class Staying:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, ``1 phase`` or ``2 phases``."""
+    """Return a number with its noun, such as ``1 phase`` or ``2 phases``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
@@ -233,13 +233,14 @@ def point_in_words(point: Iterable[float]) -> str:
 
 
 def sized(arrays: Mapping[str, Any]) -> str:
-    """Return names with the shapes of their arrays: ``gravity (3,), viscosity``."""
+    """Return names with the shapes of their arrays, such as ``gravity (3,), viscosity``."""
     shapes = {name: getattr(value, "shape", ()) for name, value in arrays.items()}
     return ", ".join(f"{name} {shape}" if shape else name for name, shape in shapes.items())
 
 
 class ShortRepr:
-    """A base class of dataclasses (made with ``repr=False``) whose ``repr`` shows arrays by their shapes."""
+    """A base class for dataclasses with a short ``repr``, which shows only the shapes of arrays. Derived dataclasses
+    need ``repr=False``."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

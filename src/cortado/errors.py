@@ -1,4 +1,4 @@
-"""Cortado's errors and warnings; each message is one sentence for the user."""
+"""Cortado's errors and warnings. Each message is one sentence."""
 
 import sys
 import warnings
@@ -14,18 +14,18 @@ class CortadoError(Exception):
 
 
 class CortadoWarning(UserWarning):
-    """A warning of something that works but is probably a mistake."""
+    """A warning about a probable mistake that does not prevent the computation."""
 
 
 class MassWarning(CortadoWarning):
-    """A warning that the fluid's mass differs from the mass that the scene describes."""
+    """A warning about a difference between the mass of the particles and the mass in the scene."""
 
 
 _INSIDE = ("cortado", "pydantic", "contextlib", "functools")
 
 
 def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
-    """Issue a warning that points to the line of the user's code."""
+    """Issue a warning at the line of the user's code."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
         level, frame = level + 1, frame.f_back
@@ -34,46 +34,47 @@ def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
 
 @contextmanager
 def unwarned(category: type[Warning] = CortadoWarning) -> Iterator[None]:
-    """Suppress Cortado's warnings of a category in the block."""
+    """Suppress Cortado's warnings of a category."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", category)
         yield
 
 
 class InputError(CortadoError):
-    """An error in the user's input. Exit code 2."""
+    """An error in the user's input. The exit code is 2."""
 
 
 class OutOfRangeError(InputError):
-    """An error for a parameter value with which no run is possible: out of range, beyond the precision, or a place
-    without room for fluid. Among many points, only the bad point fails."""
+    """An error for a parameter value that makes a run impossible. The value is out of range or beyond the precision, or
+    there is no room for the fluid. When many points are evaluated, only the bad point fails."""
 
 
 class Words(str):
-    """Words in an error's sentence that are printed without quotes; a plain ``str`` is quoted."""
+    """Text that appears without quotes in an error message. A plain ``str`` appears with quotes."""
 
 
 class MissingDerivativeError(InputError):
-    """An error for a derivative that a solver does not have."""
+    """An error for a derivative that a solver cannot compute."""
 
 
 class SceneError(CortadoError):
-    """An error in a scene, with the key, the value found and the value wanted. Exit code 2."""
+    """An error in a scene, with the key, the value found and the value wanted. The exit code is 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """Store the parts of the message; ``sentence`` replaces the default "is <found>, but must be <wanted>."."""
+        """Store the parts of the error message. ``sentence`` replaces the default "is <found>, but must be
+        <wanted>."."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
-        """Path of the scene file as the user gave it; None for a scene built in Python."""
+        """Path of the scene file as the user gave it, or None for a scene built in Python."""
         self.field = field
-        """Key of the scene, such as ``fluid[0].upper``; empty for the whole scene."""
+        """Key of the scene, such as ``fluid[0].upper``. Empty for an error of the whole scene."""
         self.found = found
-        """Wrong value, or `Words` that describe it."""
+        """Wrong value, or `Words` on the mistake."""
         self.wanted = wanted
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
-        """Return this error with the name of the file."""
+        """Return a copy of this error with the name of the file."""
         _, *rest = self.args
         return SceneError(file, *rest)
 
@@ -83,33 +84,34 @@ class SceneError(CortadoError):
 
 
 class ComputationError(CortadoError):
-    """An error for a computation that failed although the input was valid. Exit code 1."""
+    """An error for a computation that failed although the input was valid. The exit code is 1."""
 
 
 class DivergedError(ComputationError):
-    """An error for a lost particle, which left its container, or whose position is not finite or too far away."""
+    """An error for a lost particle. A particle is lost if it leaves its container, or if its position is not finite or
+    too far away."""
 
     def __init__(
         self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""
     ):
         super().__init__(step, particle, advice, where, others, preface)
         self.step = step
-        """Step in which the particle was lost, counted from 1."""
+        """Number of the step that lost the particle, counted from 1."""
         self.particle = particle
-        """Number of the first lost particle, in the scene's order."""
+        """Number of the first lost particle, in the order of the initial particles."""
         self.advice = advice
         self.where = where
-        """How the particle was lost, and where it was at the end of the step, in words."""
+        """Text on how and where the particle was lost."""
         self.others = others
-        """Number of further particles lost in the same step."""
+        """Number of further particles that were lost in the same step."""
         self.preface = preface
-        """Sentence about all runs, if this run is one of several."""
+        """Sentence on all runs, if there are several runs."""
 
     def with_advice(self, advice: str) -> "DivergedError":
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
 
     def among_others(self, preface: str) -> "DivergedError":
-        """Return a copy of this error whose message begins with ``preface``."""
+        """Return a copy of this error with ``preface`` at the beginning of its message."""
         return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:
@@ -119,7 +121,7 @@ class DivergedError(ComputationError):
 
 
 def shown(value: Any) -> str:
-    """Return a value on one short line."""
+    """Return a value as text on one short line."""
     if isinstance(value, Words):
         return str(value)
     if isinstance(value, Mapping):
@@ -135,7 +137,7 @@ def shown(value: Any) -> str:
 
 
 class EngineMissingError(CortadoError, ImportError):
-    """An error for the missing reference engine."""
+    """An error if the reference engine is not installed."""
 
     def __str__(self) -> str:
         return (
@@ -145,7 +147,7 @@ class EngineMissingError(CortadoError, ImportError):
 
 
 class ExtraMissingError(InputError, ImportError):
-    """An error for a missing library that comes with an extra of Cortado. Exit code 2."""
+    """An error if a library of an optional dependency group is not installed. The exit code is 2."""
 
     def __init__(self, name: str, package: str):
         super().__init__(name, package)
@@ -156,10 +158,11 @@ class ExtraMissingError(InputError, ImportError):
 
 
 class LibraryMissingError(CortadoError, ImportError):
-    """An error for a missing library that Cortado can do without."""
+    """An error if an optional library is not installed."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
-        """Store the library's ``name`` and ``package``, and the ``module`` of Cortado that needs it."""
+        """Store the library's ``name``, the ``package`` that contains it, and the ``module`` of Cortado that
+        needs it."""
         super().__init__(name, package, module)
         self.package = package
 

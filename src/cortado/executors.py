@@ -1,7 +1,7 @@
-"""Executors compute work whose parts are independent, such as the members of an ensemble.
+"""Executors compute independent items, such as the members of an ensemble.
 
-`InProcess`, the default, computes one part after the other. `Distributed` uses the workers of a scheduler of Dask's
-distributed, on any number of machines; `local_workers` starts workers on this machine, such as one for each GPU.
+`InProcess` is the default and computes one item after the other. `Distributed` uses the workers of a scheduler of
+Dask's distributed, on any number of machines. `local_workers` starts workers on this machine, such as one for each GPU.
 """
 
 import asyncio
@@ -32,30 +32,36 @@ __all__ = ["Distributed", "Executor", "InProcess", "local_workers"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 OnResult = Callable[[int, Any], None]
-"""A function called in the caller's thread with the number of an item, from 0, and its result, as results arrive."""
+"""A function that is called with the number of an item, from 0, and its result. The caller's thread calls it when a
+result arrives."""
 
 
 class Executor(ABC):
     """The base class of executors, which compute a function of many independent items.
 
-    The choice of an executor changes no bit of a result on the same kind of processor.
+    On the same kind of processor, the results of all executors are bitwise equal.
     """
 
     def threads(self) -> int:
-        """Return the number of items that are computed at a time."""
+        """Return the number of items computed at the same time."""
         return 1
 
     @abstractmethod
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the function's result for every item, in the order of the items. Large data, such as a problem, belong
-        into the ``function``, and ``items`` should be small. Raise the error of the first item that fails."""
+        """Return the results of ``function`` for all ``items``, in the order of the items. ``on_result`` is called for
+        each result.
+
+        Large data, such as a problem, should be part of the function, and items should be small. If items fail, the
+        error of the first failed item is raised.
+        """
 
 
 @dataclass(frozen=True)
 class InProcess(Executor):
     """An executor that computes one item after the other in this process.
+
     Example: ``results = cortado.evaluate(problem, points, executor=cortado.executors.InProcess())``
     """
 
@@ -95,22 +101,22 @@ REACHED = 10.0
 LOOK = 1.0
 WAIT = 0.1
 AHEAD = 2
-"""Number of items sent to each thread of a worker, so that it is never idle."""
+"""Number of items sent to each thread of a worker in advance."""
 
 
 class Distributed(Executor):
     """An executor on the workers of a scheduler of Dask's distributed.
 
-    Another worker computes again what a lost worker was computing. Results have the order of the items and the bits
-    that they have in one process, and errors are raised as in one process. A worker computes one item at a time, and
-    keeps the last functions that it received, with their problems.
+    If a worker is lost, its items are computed again by the remaining workers. Results and errors are bitwise the same
+    as in one process. A worker computes one item at a time, and caches the last few functions.
+
     Example: ``workers = cortado.executors.Distributed("tcp://10.0.0.1:8786")``
     """
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
-        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client. ``patience`` [s] is how long
-        to wait when no worker is left. Raises `InputError` if distributed is not installed, or if there is no
-        scheduler."""
+        """Connect to ``scheduler``, which is an address such as "tcp://10.0.0.1:8786" or a client. ``patience`` is the
+        waiting time for a worker when all workers are lost [s]. Raises `InputError` if distributed is not installed or
+        if there is no scheduler."""
         module = _distributed()
         self.patience = patience
         self._owned = isinstance(scheduler, str)
@@ -133,20 +139,24 @@ class Distributed(Executor):
         self.close()
 
     def close(self) -> None:
-        """Leave the scheduler; a client of the user stays connected."""
+        """Disconnect from the scheduler. If the user gave a client, the client remains connected."""
         if self._owned:
             self.client.close()
 
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the function's results for all items, which are pickled; see `Executor.map`. Wait for the first
-        worker. Raise `InputError` for what cannot be pickled, and `ComputationError` without scheduler or workers."""
+        """Return the results of ``function`` for all ``items``; see `Executor.map`. The computation begins as soon as
+        there is a worker. ``on_result`` is called for each result.
+
+        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` without a scheduler or
+        workers.
+        """
         _check_call(function, items, on_result)
         return _Map(self, Payload.of(function), on_result).results(items)
 
     def threads(self) -> int:
-        """Return the number of items computed at a time; raise `ComputationError` if the scheduler is lost."""
+        """Return the number of items computed at the same time. Raises `ComputationError` if the scheduler is lost."""
         if self.client.status != "running":
             raise self.lost()
         try:
@@ -155,7 +165,7 @@ class Distributed(Executor):
             raise self.lost() from error
 
     def replace_workers(self) -> None:
-        """Replace ended workers that are processes of this machine; called every second during a computation."""
+        """Replace ended workers of this machine. The method is called every second during a computation."""
 
     def lost(self) -> ComputationError:
         return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
@@ -172,15 +182,15 @@ class _Map:
         self._executor, self._payload, self._on_result = executor, payload, on_result
         self._calls = executor.client.get_executor(pure=False)
         self._sent: dict[Future[Any], tuple[int, bytes]] = {}
-        """Numbers and items that workers have, by their futures."""
+        """Number and item of each future."""
         self._results: dict[int, Any] = {}
         self._failed: tuple[int, BaseException] | None = None
-        """The first item, in order, with a known error, and this error."""
+        """Number and error of the first failed item."""
         self._name = f"cortado-{uuid4().hex}"
         self._lost: deque[str] = deque()
         self._most = 0
         self._counted, self._manned = -LOOK, time.monotonic()
-        """Times of the last count of workers, and of the last count that found any [s]."""
+        """Time of the last count of workers, and time of the last count above 0 [s]."""
 
     def results(self, items: Iterable[Item]) -> list[Any]:
         import dask
@@ -226,7 +236,7 @@ class _Map:
             warn(f"The worker {worker} was lost; what it was computing is computed again by another one.")
 
     def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
-        """Send items to workers, none after an error; return True if there is a result to wait for."""
+        """Send items to workers, unless an item has failed. Return True if a result is still missing."""
         self._count_workers(LOOK)
         while not self._most and not self._sent:  # how much an item asks for may depend on how many workers there are
             time.sleep(WAIT)
@@ -242,7 +252,7 @@ class _Map:
         self._sent[self._calls.submit(call, payload, item, key=key)] = number, item
 
     def _count_workers(self, interval: float) -> None:
-        """Count workers, at most once per interval [s]; raise `ComputationError` if there are none for too long."""
+        """Count workers, at most once per interval [s]. Raises `ComputationError` if there are none for too long."""
         now = time.monotonic()
         if now - self._counted < interval:
             return
@@ -255,7 +265,8 @@ class _Map:
             raise self._executor.deserted(now - self._manned)
 
     def _take(self, future: Future[Any]) -> None:
-        """Take the result of a call that has ended; if the worker lacks the function, send it."""
+        """Store the result of a finished call. If the worker does not have the function, send the function to the
+        worker."""
         number, item = self._sent.pop(future)
         try:
             answer = self._answer(future, number)
@@ -273,7 +284,6 @@ class _Map:
             self._on_result(number, self._results[number])
 
     def _answer(self, future: Future[Any], number: int) -> Answer | Lacking:
-        """Return the answer of a call that has ended; raise `ComputationError` if it has none."""
         try:
             answer = future.result()
         except CancelledError:
@@ -303,7 +313,7 @@ def _connected(module: Any, address: str) -> Any:
     from distributed.comm import connect
 
     async def meet() -> None:
-        """Raise `OSError` without an answer at once, as a client would try for longer."""
+        """Raise `OSError` quickly if the scheduler does not answer."""
         comm = await connect(address, timeout=REACHED)
         await comm.close()
 
@@ -323,22 +333,22 @@ def _connected(module: Any, address: str) -> Any:
 
 LOOPBACK = "127.0.0.1"
 GONE = "3 s"
-"""Time after which another process replaces one that has ended."""
+"""Waiting time before an ended process is replaced."""
 PROCESSES_A_CORE = 4
 LEAST_LIMIT = 64
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""Code with which workers ignore Ctrl-C, which a terminal sends to all processes."""
+"""Python code that makes workers ignore Ctrl-C."""
 
 
 class LocalWorkers(Distributed):
-    """An executor on worker processes of this machine, each with a nanny that restarts it when killed."""
+    """An executor on worker processes of this machine. Each worker has a nanny process that restarts the worker."""
 
     def __init__(self, client: Any, cluster: Any):
         super().__init__(client)
         self._cluster = cluster
 
     def replace_workers(self) -> None:
-        """Replace workers whose nanny has ended."""
+        """Replace workers if their nanny process has ended."""
         self._cluster.scale(len(self._cluster.worker_spec))
 
     def deserted(self, seconds: float) -> ComputationError:
@@ -350,13 +360,14 @@ class LocalWorkers(Distributed):
 
 @contextmanager
 def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
-    """Start worker processes on this machine with a scheduler in this process, which restarts lost ones, and end them
-    with the block.
+    """Start worker processes on this machine, and a scheduler in this process. The scheduler restarts lost workers. The
+    processes end at the end of the ``with`` block.
 
-    ``number`` of processes: by default one for each core, or with the ``device`` "cuda" one for each GPU. Processes
-    share the cores; on GPUs each process sees one GPU, as "cuda:0". A script must begin under ``if __name__ ==
-    "__main__":``, as every process imports it. Raises `InputError` for more processes than there are GPUs, or than 64
-    and four for each core.
+    ``number`` is the number of processes, by default one for each core, or one for each GPU with the ``device`` "cuda".
+    On GPUs each process sees one GPU as "cuda:0". Every process imports the script. The code of the script must
+    therefore be under ``if __name__ == "__main__":``.
+
+    Raises `InputError` for more processes than GPUs, or for more than 64 processes and more than four for each core.
 
     Example: ``with cortado.executors.local_workers() as workers: ...``
     """
@@ -403,7 +414,8 @@ def _environments(number: int | None, device: str) -> list[dict[str, str]]:
 
 
 def require_processes(what: str, number: object) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, unless a number of processes is possible."""
+    """Raise `InputError` unless ``number`` is a possible number of processes. The error message begins with
+    ``what``."""
     require_whole(what, number, 1)
     cores = usable_cores()
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)

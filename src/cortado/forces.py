@@ -1,4 +1,5 @@
-"""Your own forces, each made from one function, for ``Simulation(scene, forces=[...])``; see `docs/own_parts.md`."""
+"""User-defined forces, made from a function, for ``Simulation(scene, forces=[...])``. `docs/own_parts.md` has
+examples."""
 
 from cortado.calls import face
 from cortado.sph.own_force import Body, OverTime, Pair, Rheology

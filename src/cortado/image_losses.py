@@ -1,4 +1,4 @@
-"""Differences between an image (rows, columns, 3) and its target as one number, with derivatives."""
+"""Losses that compare an image (rows, columns, 3) with a target image, with derivatives."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from cortado.errors import InputError
 __all__ = ["ImageLoss", "Pyramid", "SquaredDifference", "psnr"]
 
 Image = NDArray[np.float64]
-"""A linear picture (rows, columns, 3) of red, green and blue."""
+"""A linear RGB picture (rows, columns, 3)."""
 SMALLEST = 2
 
 
 class ImageLoss(Protocol):
-    """Protocol of a differentiable loss that compares an image with its target."""
+    """Protocol of a differentiable loss that compares an image with a target image."""
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the loss and its settings; checkpoints store it."""
+        """Return a text that identifies the loss and its settings, for checkpoints."""
 
     def value(self, image: ArrayLike, target: ArrayLike) -> float:
         """Return the loss of an image (rows, columns, 3)."""
 
     def adjoint(self, image: ArrayLike, target: ArrayLike) -> Image:
-        """Return the derivative (rows, columns, 3) of the loss with respect to the image."""
+        """Return the gradient of the loss with respect to the image (rows, columns, 3)."""
 
 
 @dataclass(frozen=True)
 class SquaredDifference:
     """An image loss: the mean over pixels and channels of the squared difference.
 
-    Where a shape does not overlap its target, the gradient does not move it towards the target; `Pyramid` helps then.
+    If a shape does not overlap its target, the gradient does not move the shape towards the target. Use `Pyramid` then.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.SquaredDifference())``
     """
@@ -60,17 +60,21 @@ class Pyramid:
     """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
     Adelson 1983).
 
-    The first level is the image. Each further level is the previous one, blurred by a binomial and halved
-    (`reduction`). Coarse levels locate a shape before it overlaps its target; fine levels compare outlines. ``levels``
-    is their number, and ``weights`` has a number for each, by default 1, 2, 4 ... from fine to coarse.
+    The first level is the image. Each further level is the previous level, blurred and halved in size. Coarse levels
+    locate a shape before it overlaps its target, and fine levels compare outlines.
+
+    ``levels`` is the number of levels. ``weights`` has one number for each level, by default 1, 2, 4 ... from fine to
+    coarse levels.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """If None, as many as weights; without weights, until no side is longer than 2 pixels."""
+    """Number of levels. If None, it is the number of weights. Without weights, the coarsest level has sides of at most
+    2 pixels."""
     weights: tuple[float, ...] | None = None
-    """(levels,) from fine to coarse, as blurring makes shapes fainter"""
+    """Weights of the levels (levels,) from fine to coarse. They should increase, because blurring makes shapes
+    fainter."""
 
     def __post_init__(self) -> None:
         if self.levels is not None:
@@ -118,9 +122,9 @@ class Pyramid:
 
 
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
-    """Return the peak signal-to-noise ratio [dB] for a peak of 1; infinite for two equal images.
+    """Return the peak signal-to-noise ratio [dB] for a peak of 1. It is infinite if the images are equal.
 
-    ``image`` and ``target`` are (rows, columns, 3), linear.
+    ``image`` and ``target`` are linear pictures (rows, columns, 3).
 
     Example: ``print(cortado.image_losses.psnr(renderer.render(frame), target))``
     """
@@ -129,24 +133,25 @@ def psnr(image: ArrayLike, target: ArrayLike) -> float:
 
 
 def reduce(image: Image) -> Image:
-    """Return the next level (ceil(rows / 2), ceil(columns / 2), 3) of a Gaussian pyramid."""
+    """Return the next coarser level of a Gaussian pyramid (ceil(rows / 2), ceil(columns / 2), 3)."""
     rows, columns = image.shape[:2]
     return _along_columns(_along_rows(image, reduction(rows)), reduction(columns))
 
 
 def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
-    """Return the adjoint of an image (rows, columns) from that of its next level: `reduce` transposed."""
+    """Return the adjoint of an image (rows, columns), given the adjoint of the next coarser level. This is the
+    transpose of `reduce`."""
     rows, columns = shape
     return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
 
 
 @lru_cache(maxsize=64)
 def reduction(size: int) -> Any:
-    """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every other one.
+    """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every second pixel.
 
-    For an odd size, Burt and Adelson's weights 1 4 6 4 1 are centred on every other pixel, from the first to the last.
-    For an even size, weights 1 3 3 1 treat both ends alike. At an edge the weights inside the image are divided by
-    their sum, so that a constant stays constant.
+    For an odd size, Burt and Adelson's weights 1 4 6 4 1 are centred on every second pixel, beginning with the first.
+    For an even size, the weights are 1 3 3 1. At an edge the weights are normalised, so that a constant image remains
+    constant.
     """
     from scipy.sparse import csr_array
 

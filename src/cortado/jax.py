@@ -1,9 +1,11 @@
-"""Cortado as a layer of JAX: see `docs/layers.md`.
+"""Cortado as a layer of JAX. `docs/layers.md` has examples.
 
-States are dictionaries of arrays by the names of their fields, in the simulation's precision, with their ``time`` [s];
-parameters are dictionaries with the names of `Problem`. All functions are differentiable in both modes, run as batches
-under `jax.vmap`, and work inside `jax.jit` and `jax.lax.scan`. Second derivatives raise an error. Inside compiled
-programs JAX raises its own error, which contains Cortado's sentence.
+States are dictionaries of arrays by field name, in the simulation's precision, including the ``time`` [s]. Parameters
+are dictionaries with the names of `Problem`.
+
+All functions are differentiable in forward and reverse mode, run as batches under `jax.vmap`, and work inside `jax.jit`
+and `jax.lax.scan`. Second derivatives raise an error. In compiled programs Cortado's error message is part of JAX's
+error message.
 """
 
 from cortado.calls import face

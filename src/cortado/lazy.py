@@ -1,7 +1,7 @@
 """Import names when they are first used, so that ``import cortado`` is quick.
 
-The core does not import the packages built on it: pictures, films, exports, notebook pages. A method such as
-`Trajectory.film` imports a function of such a package by name (`on_top`).
+Cortado's core does not import packages such as pictures and exports. A method of the core, such as `Trajectory.film`,
+imports a function of a package by name with `on_top`.
 """
 
 import importlib
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[[str], Any]":
     """Return a ``__getattr__`` for a package, which imports its modules and the names in ``homes``. ``homes`` maps a
-    name to its module: of the package, or of Cortado if it begins with ``cortado.``."""
+    name to its module. The module is relative to the package unless it begins with ``cortado.``."""
 
     def found(name: str) -> "Any":
         if homes and name in homes:

@@ -1,4 +1,4 @@
-"""Optimisers for `cortado.optimise`: the public names of `cortado.optimisation.optimisers`."""
+"""Optimisers for `cortado.optimise`."""
 
 from cortado.optimisation.optimisers import *  # noqa: F403
 from cortado.optimisation.optimisers import __all__ as __all__

@@ -38,16 +38,16 @@ from cortado.sph.function_text import code_words
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
-"""Quantities are read during the run if one state in so many is needed; else repeating steps costs less."""
+"""Greatest ratio of all states to needed states at which quantities are read during the run."""
 KEPT = 2
 
 
 @dataclass(frozen=True)
 class ProblemForwardPass(Staying):
-    """A forward run of a problem with its loss, and with backward passes through it."""
+    """A stored forward run of a problem, for backward passes."""
 
     loss: Any
-    """Loss of the run: a number, or an array (batch,) for a batch."""
+    """Loss of the run: a number, or an array (batch,) for a batch of scenes."""
     instead = "but the problem can, and the parameters, with which it is run again"
     _residual: Residual
     _values: Arrays
@@ -65,16 +65,18 @@ class ProblemForwardPass(Staying):
 
     @in_turn
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Return the gradient by an ``estimator``, with the same bits if the problem was evaluated in between.
+        """Return the gradient, computed by an ``estimator``. Later evaluations of the problem do not change the result.
+
         ``observe`` is called with the number and the adjoint of every state, from the last to the first. Raises
-        `InputError` for an estimator whose settings may change, or that may mix scenes of a batch."""
+        `InputError` if the estimator's settings can change, or if it may mix scenes of a batch.
+        """
         derivative = self._derivatives.of(estimator)
         return self._gradient(derivative, self._first_adjoint(derivative, observe))
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """Return the gradient by an ``estimator``, and derivatives with respect to the first state's fields and its
-        ``time``, by name."""
+        """Return the gradient computed by an ``estimator``, and the derivatives with respect to the first state. The
+        derivatives are a table with the names of the state's fields and ``time``."""
         derivative = self._derivatives.of(estimator)
         first = self._first_adjoint(derivative)
         initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
@@ -107,26 +109,26 @@ class ProblemForwardPass(Staying):
 @public
 @fixed
 class Problem:
-    """A loss of a simulation over a number of steps, as a function of parameters.
+    """The loss of a simulation over a number of steps, as a function of parameters.
 
-    Parameters, any of them together:
+    These parameters may be given in any combination:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
     - instead of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], the angle by which the scene's gravity is
-      turned; its size stays. Gravity along -y turns towards x and, in 3-D, z; see
+      turned without a change of its magnitude. Gravity along -y turns towards x and, in 3-D, z; see
       `cortado.scene.parameter_values.Tilt`;
     - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
-    - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3], a number, with several phases (phases,);
-    - with several phases the first ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
-    - with emitters ``NAME.path`` (d,) or (steps, d), the opening's place after each step [m]; with emitters and sinks
-      ``NAME.flow_rate``, a number or (steps,) [m3 / s];
-    - in a scene with surface tension ``surface_tension`` [N / m];
-    - with a loss of images ``colours`` (phases, 3);
-    - with forces of your own in ``simulation.forces``, the parameters of these forces, such as ``drag.k``.
+    - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3]: a number, or (phases,) with several phases;
+    - with several phases, the initial ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
+    - with emitters, ``NAME.path`` (d,) or (steps, d), the position of the opening after each step [m];
+    - with emitters and sinks, ``NAME.flow_rate``, a number or (steps,) [m3 / s];
+    - in a scene with surface tension, ``surface_tension`` [N / m];
+    - with a loss of images, ``colours`` (phases, 3);
+    - with user-defined forces in ``simulation.forces``, the parameters of these forces, such as ``drag.k``.
 
-    Parameters left out have the scene's values, with its schedule. n counts fluid particles, in the scene's order.
-    Methods take ``parameters``, a table of values by these names. Their ``gradient`` or ``estimator`` is an object of
-    `cortado.gradients`, by default `cortado.gradients.Exact`.
+    Omitted parameters have the scene's values, including schedules. n is the number of fluid particles, in the order of
+    the scene. Methods take ``parameters``, a table of values by parameter name. The arguments ``gradient`` and
+    ``estimator`` are objects of `cortado.gradients`, by default `cortado.gradients.Exact`.
 
     Example::
 
@@ -145,10 +147,12 @@ class Problem:
     ):
         """Make a problem of ``steps`` steps. With 0 steps the loss is computed from the first state.
 
-        ``loss``: an object with ``value`` and ``adjoint``, `losses.Frames` of such, or a function of Warp arrays (see
-        `losses.Recorded`). ``memory_budget``: bytes of states that the forward run may store; the backward pass
-        recomputes the others. ``state``: the state to begin from, or one for each scene of a batch. Parameters are then
-        of the steps that follow it, and initial values cannot be given. See `Simulation.state`.
+        ``loss`` is an object with ``value`` and ``adjoint``, a `losses.Frames` of such objects, or a function of Warp
+        arrays (see `losses.Recorded`). ``memory_budget`` is the memory [bytes] for states stored by the forward run.
+        The backward pass computes the remaining states again.
+
+        ``state`` is the first state, or a list with one first state for each scene of a batch; see `Simulation.state`.
+        If ``state`` is given, parameters apply to the steps after it, and initial values are not accepted.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
@@ -175,28 +179,29 @@ class Problem:
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """Return the loss at ``parameters``: a float, or (batch,) for a batch, with NaN for a scene in ``lost``."""
+        """Return the loss at ``parameters``: a number, or an array (batch,) for a batch. The loss of scenes in ``lost``
+        is NaN."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
-        """Return the last state of the rollout at ``parameters``: a `Snapshot`, or a `SnapshotBatch` for a batch."""
+        """Return the last state of a run with ``parameters``: a `Snapshot`, or a `SnapshotBatch` for a batch."""
         return self.states(parameters, [self.steps])[self.steps]
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """Return states of the rollout at ``parameters`` after the given numbers of ``steps``, by number; 0 is the
-        first state."""
+        """Return states of a run with ``parameters``, by the number of steps before the state. ``steps`` are the wanted
+        numbers, and 0 is the first state."""
         return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
     def run(self, parameters: Values, record_every: int = 1) -> Any:
-        """Return the trajectory at ``parameters``, with a frame every ``record_every`` steps."""
+        """Return the trajectory of a run with ``parameters``, with a frame every ``record_every`` steps."""
         self._space.begin(self._rollout, self._checked(parameters), states=self._states)
         return self.simulation.collect(self._rollout, record_every)
 
     def value_and_gradient(self, parameters: Values, gradient: GradientEstimator | None = None) -> tuple[Any, Arrays]:
-        """Return the loss and its derivatives at ``parameters``: for each of them a float64 array of its shape, for a
-        batch with a first axis over the scenes."""
+        """Return the loss at ``parameters`` and its derivatives by parameter name. A derivative is a float64 array in
+        the shape of the parameter. For a batch, each array has a first axis for the scenes."""
         found = self.estimate(parameters, gradient)
         return found.loss, found.gradient
 
@@ -204,9 +209,13 @@ class Problem:
     def value_and_gradients(
         self, parameters: Values, gradient: AdjointEstimator | None = None
     ) -> tuple[Any, Arrays, Arrays]:
-        """Return the loss, its derivatives as `value_and_gradient` does, and its derivatives with respect to the first
-        state: by name ``time`` and float64 arrays in the fields' shapes, for a batch with a first axis over the
-        scenes."""
+        """Return the loss, its derivatives with respect to ``parameters``, and its derivatives with respect to the
+        first state.
+
+        The loss and its derivatives with respect to parameters are as in `value_and_gradient`. The derivatives with
+        respect to the state are a table of float64 arrays by field name, with ``time``. For a batch, each array has a
+        first axis for the scenes.
+        """
         forward_pass = self.forward_pass(parameters)
         return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
 
@@ -214,11 +223,11 @@ class Problem:
     def estimate(
         self, parameters: Values, gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Return the loss, its derivatives, and the report of the estimator ``gradient`` (`gradients.Exact` by
-        default).
+        """Return the loss, its derivatives, and the report of the estimator ``gradient`` (by default
+        `gradients.Exact`).
 
-        Estimators with a backward pass call ``observe``, such as `gradients.AdjointNorms`, with the number and the
-        adjoint of every state, from the last to the first.
+        Estimators with a backward pass call ``observe`` with the number and the adjoint of every state, from the last
+        to the first. `gradients.AdjointNorms` is an example of ``observe``.
         """
         require_function("observe", observe, *OBSERVED)
         found = estimate(self, parameters, gradient, observe)
@@ -244,8 +253,8 @@ class Problem:
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
-        """Return the derivative of the loss along ``directions`` (of any parameters) by forward mode: a float, or
-        (batch,) for a batch."""
+        """Return the derivative of the loss along ``directions``, by forward mode: a number, or an array (batch,) for a
+        batch. ``directions`` maps names of parameters to tangents."""
         dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
@@ -264,17 +273,19 @@ class Problem:
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run in forward mode and return states after the given numbers of ``steps``. ``observe`` is called with the
-        number of every state and its tangent along ``directions`` (of any parameters), which the next step
-        overwrites."""
+        """Run in forward mode, and return a table of the states after the given numbers of ``steps``.
+
+        ``directions`` maps names of parameters to tangents. ``observe`` is called with the number and the tangent of
+        every state. The next step overwrites the tangent.
+        """
         return self.several_tangents(parameters, [(directions, observe)], steps)
 
     @in_turn
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run once in forward mode along several directions: ``each`` are pairs of directions and an observer, as in
-        `tangents`. Return states after the given numbers of ``steps``."""
+        """Run once in forward mode along several directions, and return a table of the states after the given numbers
+        of ``steps``. ``each`` yields pairs of directions and an observer, as in `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for directions, observe in each:
             require_arguments("observe", observe, OBSERVED)
@@ -287,8 +298,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Return tangents of ``quantities`` of ``end``, a state of the last run, by name. ``dot`` is the state's
-        tangent by field; ``directions`` are those of the parameters."""
+        """Return tangents of ``quantities`` by name, in the state ``end`` of the last run. ``dot`` is the tangent of
+        the state by field name; ``directions`` are the tangents of the parameters."""
         names = list(quantities)
         if not names:
             return {}
@@ -298,11 +309,12 @@ class Problem:
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:
-        """Errors, by scene number, of the scenes of a batch that lost a particle in the last evaluation."""
+        """Errors of the scenes of a batch that lost a particle in the last evaluation, by scene number."""
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return how many points one call of `together` can take with an ``estimator``; see `Batchable.room`."""
+        """Return the greatest number of points for one call of `together` with an ``estimator``; see
+        `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -311,7 +323,7 @@ class Problem:
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at several ``points`` in one launch; see `Batchable.together`."""
+        """Return estimates at several ``points``, which are computed as one batch; see `Batchable.together`."""
         require_points(points)
         if estimator is not None:
             checked_reverse(estimator)
@@ -326,14 +338,14 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """Return a problem that begins at another ``state`` and shares this problem's arrays."""
+        """Return a problem that begins at the given ``state``. It shares this problem's arrays."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
         return found
 
     def batch_of(self, size: int) -> "Problem":
-        """Return this problem with ``size`` scenes in one launch; the last few sizes are kept."""
+        """Return this problem for a batch of ``size`` scenes. The problems of the last few sizes are kept."""
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))
@@ -344,9 +356,11 @@ class Problem:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the problem: steps, precision, scene, first positions, free energy, user-defined forces
-        and solver, and the ``fingerprint`` of the loss or the code of a loss function. Any other loss enters by its
-        type alone."""
+        """Text that identifies the problem, for checkpoints.
+
+        It includes steps, precision, scene, first positions, free energy, user-defined forces and the solver. The loss
+        is identified by its ``fingerprint`` or the code of its function, or else only by its type.
+        """
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {
             "scene": simulation.scene.computed_json().encode(),
@@ -365,23 +379,22 @@ class Problem:
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
 
     def iterations(self) -> np.ndarray:
-        """Return the pressure iterations (steps,) of the last evaluation, for a solver with one iteration loop."""
+        """Return the pressure iterations (steps,) of the last evaluation, for solvers with a single iteration loop."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics (steps,) of the last evaluation, by name: ``converged``, and further ones of the solver."""
+        """Diagnostics (steps,) of the last evaluation, by name, such as ``converged``. The names depend on the
+        solver."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:
-        """Return the parameters as arrays, after a check against the given first state."""
         values = self._space.checked(parameters)
         self._space.check_restarts(self._states, values)
         self.simulation.judged_states.update(one for one in self._states if one.origin is not None)
         return values
 
     def _ends(self, values: Arrays, steps: Iterable[int], keep: bool, varied: Iterable[str] = ()) -> dict[int, Any]:
-        """Run forward and return states by their number of steps; ``keep`` stores checkpoints for a backward pass."""
         wanted, single, ends = set(steps), self.simulation.batch is None, dict[int, Any]()
         each = np.array([self._space.colours(own) for own in self._space.members(values)])
         made, colours = (Snapshot, each[0]) if single else (SnapshotBatch, each)

@@ -1,4 +1,4 @@
-"""The C++ reference engine, which checks gradients; it is installed as a separate package, ``cortado-reference``."""
+"""The C++ reference engine that checks gradients, from the separate package ``cortado-reference``."""
 
 from cortado.calls import face
 from cortado.errors import EngineMissingError

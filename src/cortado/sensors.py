@@ -1,5 +1,4 @@
-"""Sensors: pressure at a point, height of the fluid's surface, flow rate, load on a solid, spring force, motion of a
-body."""
+"""Sensors of pressure, wave height, flow rate, loads on solids, spring forces and motions of rigid bodies."""
 
 from cortado.calls import face
 from cortado.runs.body_sensors import BodyMotion, SpringForce

@@ -1,4 +1,4 @@
-"""The class `Simulation`: a scene prepared to run on a device in a floating-point precision."""
+"""The class `Simulation`: a scene prepared to run on a device in a precision."""
 
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
@@ -47,15 +47,15 @@ from cortado.watching import Watch
 WORTH = {"cpu": 16_000, "cuda": 1_000_000}
 Controls = Mapping[str, Any] | None
 Start = RestartState | Sequence[RestartState]
-"""A state to begin from, or one for each scene of a batch."""
+"""A state to start from, or a sequence with one state for each scene of a batch."""
 
 
 @public
 @fixed
 class Simulation(Stepping):
-    """A scene made ready to run: particles sampled, masses calibrated, kernels chosen.
+    """A scene prepared to run.
 
-    Only one thread at a time uses a simulation. A simulation can be pickled and used after a fork; see
+    Only one thread at a time may use a simulation. A simulation can be pickled and used after a fork; see
     `docs/processes.md`.
 
     Example::
@@ -77,12 +77,18 @@ class Simulation(Stepping):
         solver: build.SolverMaker | None = None,
         lanes: int | None = None,
     ):
-        """Prepare ``scene``, a `Scene` or the path of its file. ``device``: "cpu" or "cuda:0", as in Warp.
-        ``precision``: "float32" or "float64". ``free_energy`` replaces the scene's. ``batch``: number of copies in one
-        launch, each with its parameters. ``forces``: user-defined forces, such as `cortado.forces.Body`, added to the
-        scene's. ``solver``: a function that makes a user-defined solver, which replaces the scene's; see
-        `docs/own_parts.md`. ``lanes``: GPU threads per particle, by default the fastest number for one scene of this
-        size; see `docs/batches.md`."""
+        """Prepare ``scene``, which is a `Scene` or the path of its file.
+
+        Args:
+            device: "cpu" or "cuda:0", as in Warp.
+            precision: "float32" or "float64".
+            free_energy: replaces the free energy of the scene.
+            batch: number of copies of the scene that are computed together. Each copy has separate parameters.
+            forces: user-defined forces, such as `cortado.forces.Body`, in addition to the forces of the scene.
+            solver: maker of a user-defined solver that replaces the scene's solver; see `docs/own_parts.md`.
+            lanes: GPU threads per particle. The default is the fastest number for one scene of this size; see
+                `docs/batches.md`.
+        """
         scene, self.batch = as_scene(scene), None if batch is None else whole_number("batch", batch, 1)
         start_warp()
         if free_energy is not None and not isinstance(free_energy, FreeEnergy):
@@ -93,10 +99,9 @@ class Simulation(Stepping):
         self.scene = scene
         self._given = build.checked_makers(forces), None if solver is None else build.checked_solver(solver)
         self.forces = (*build.forces_named(scene), *self._given[0])
-        """Makers of the forces that are not part of Cortado: of packages named in the scene, and user-defined ones."""
+        """Makers of user-defined forces and of forces of installed packages."""
         self._maker = self._given[1] or build.solver_named(scene.solver)
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
-        """Maker of a solver that is not one of Cortado's, or None."""
         self._called, self._lanes = build.called(scene.solver, self._given[1]), checked_lanes(lanes)
         self.known = build.known_of(self.forces, self._maker, scene)
         self.device = device_named(device)
@@ -109,25 +114,24 @@ class Simulation(Stepping):
         require(parts, f"take {smaller}a larger spacing or a smaller container", self.device)
         check_distance(scene, discrete, self.precision)
         self.positions, self.velocities = discrete.fluid.positions, discrete.fluid.velocities
-        """First positions (n, d) [m] and first velocities (n, d) [m/s]."""
+        """Initial positions (n, d) [m] and velocities (n, d) [m/s]."""
         self.mass_fractions = np.eye(len(scene.phase))[discrete.fluid.phase]
-        """First mass fractions (n, phases) [-]."""
+        """Initial mass fractions (n, phases) [-]."""
         self.particles = len(self.positions)
         build.check_own(self.known, self)
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """Positions of wall particles (b, d) [m], and the numbers of their solids (b,) as in `wall_numbers`; -1 for the
+        """Positions of wall particles (b, d) [m], and numbers of their solids from `wall_numbers` (b,); -1 for the
         container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
-        """Constants of the rest lattice; masses of the fluid at the start [kg], and those that the scene describes."""
+        """Constants of the rest lattice, and initial and prescribed masses of the fluid [kg]."""
         self.free_particles = discrete.fluid.emitted.start
-        """Number of particles outside nozzles at the start, which come first in arrays."""
+        """Number of particles that do not start in an emitter. Arrays contain these particles first."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
         self.solver: Solver = build.built(self._maker, build.SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
         self.judged_states: WeakSet[RestartState] = WeakSet()
-        """States that were checked once and cannot change."""
         first = SceneParameters(self, 0).first(self.parameters())
         self.initial.set(first if self.batch is None else {name: [a] * self.batch for name, a in first.items()})
         for array in (self.positions, self.velocities, self.mass_fractions, self.walls):
@@ -136,7 +140,8 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """Name of a solver that adds fields to states, so that no other solver can continue from them; else None."""
+        """Name of the solver if its states have additional fields, else None. Only this solver can continue from these
+        states."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -174,18 +179,27 @@ class Simulation(Stepping):
         time: float | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run from the scene's first state and return the frames: the first state, every ``record_every``-th and the
-        last. A batch returns a `TrajectoryBatch`. ``time`` [s], instead of ``steps``, runs until the first step that
-        ends at this time or later.
+        """Run from the initial state of the scene and return a trajectory. Its frames are the first state, every
+        ``record_every``-th state and the last state. A batch returns a `TrajectoryBatch`.
 
-        ``controls={"gravity": (d,) or (steps, d)}`` [m/s2] replaces the scene's gravity and its schedule; any other
-        parameter of `Problem` can be given as well. ``state``, the ``last_state`` of an earlier trajectory (one for
-        each scene of a batch), continues that run bit for bit. Parameters over time then have a value for each
-        remaining step, and a rest density given to the earlier run must be given again. ``record=["density"]`` stores
-        particle quantities with every frame: see `quantity`. ``sensors``, by name, are read in every step besides the
-        scene's: see `cortado.sensors`. ``observe`` is called with the number of each step, to show progress. Warns if
-        the pressure did not converge. If a particle is lost, a single run raises `DivergedError`; a batch warns and
-        continues without that scene.
+        Args:
+            steps: number of steps.
+            controls: parameters by name, such as ``{"gravity": [0.0, -5.0]}``, (d,) or (steps, d) [m/s2]. They
+                replace the values of the scene and its schedule. All parameters of `Problem` are possible.
+            record_every: number of steps between frames.
+            state: the ``last_state`` of an earlier trajectory, or a sequence with one state for each scene of a
+                batch. The run continues exactly (bit for bit). Parameters over time then need a value for each
+                further step. A rest density that was given to the earlier run must be given again.
+            record: names of particle quantities that are stored with every frame, such as ``["density"]``; see
+                `quantity`.
+            sensors: sensors by name, in addition to the scene's sensors. They are read in every step; see
+                `cortado.sensors`.
+            observe: a function that is called with the number of each step, to show progress.
+            time: duration [s] in place of ``steps``. The run ends with the first step that ends at this time or
+                later.
+
+        Warns if the pressure did not converge. If a particle is lost, a single run raises `DivergedError`. A batch
+        warns and continues without the scene that lost a particle.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one
@@ -207,8 +221,8 @@ class Simulation(Stepping):
         sensors: Mapping[str, Sensor] | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a ``rollout`` forward and return its frames. ``record_every``, ``record``, ``sensors``, ``observe``,
-        warnings and errors are as in `run`."""
+        """Run a ``rollout`` forward and return its frames. The arguments ``record_every``, ``record``, ``sensors`` and
+        ``observe``, warnings and errors are as in `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
@@ -241,12 +255,12 @@ class Simulation(Stepping):
         return [field.name for field in self.initial.fields if not field.is_constant]
 
     def numbers_in_frame(self, components: int) -> int:
-        """Return the greatest number of numbers in a `frame`, for vectors with so many ``components``."""
+        """Return the count of numbers in a `frame`, where each vector has ``components`` components."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
-        """Return the fields of the states of a ``rollout`` that no step changes."""
+        """Return the fields of the states of a ``rollout`` that steps do not change."""
         names = [field.name for field in rollout.initial.fields if field.is_constant]
         return rollout.initial.numpy(self.dimension, only=names)
 
@@ -254,8 +268,8 @@ class Simulation(Stepping):
     def rollout(
         self, steps: int | None = None, controls: Controls = None, state: Start | None = None, time: float | None = None
     ) -> Rollout:
-        """Return a rollout ready to run forward from the scene's first state, or from ``state``, over ``steps`` steps
-        or a ``time`` [s]; ``controls`` are as in `run`."""
+        """Return a rollout of ``steps`` steps, or of a ``time`` [s]. It starts at ``state``, by default at the initial
+        state of the scene. ``controls`` are as in `run`."""
         rollout = Rollout(self.solver, steps_of_run(self, steps, time, {} if controls is None else controls))
         self._begin(rollout, controls, state, time)
         return rollout
@@ -269,23 +283,23 @@ class Simulation(Stepping):
         end_after(rollout, time)
 
     def quantity(self, name: str, of: Start | Trajectory | None = None, controls: Controls = None) -> np.ndarray:
-        """Return a quantity of the particles: "density" [kg/m3], "pressure" [Pa], "speed" [m/s], "vorticity" [1/s],
-        "wall_force" [N]; see `docs/sensors.md`. Fields of the state work too, such as one of a user-defined solver, and
-        the load on a solid, such as "rotor.load".
+        """Return a quantity of the particles: "density" [kg/m3], "pressure" [Pa], "speed" [m/s], "vorticity" [1/s] or
+        "wall_force" [N]; see `docs/sensors.md`. The name can also be a field of the state, or the load on a solid, such
+        as "rotor.load".
 
         Args:
             name: name of the quantity.
-            of: a state of this simulation (of a batch, one for each scene), or a trajectory, which is evaluated frame
-                by frame; by default the scene's first state.
-            controls: as in `run`, for the step that begins at the state, in which the pressure is computed. For a
-                trajectory, give the controls of its run.
+            of: a state of this simulation, a sequence with one state for each scene of a batch, or a trajectory. The
+                default is the initial state of the scene.
+            controls: parameters of the step that starts at the state, as in `run`. For a trajectory, give the
+                controls of its run.
 
         Returns:
-            float64 (n,) or (n, k) in the scene's order, for a trajectory (frames, n, ...). A field has its shape, and
-            a load (k,).
+            float64 (n,) or (n, k) in the order of the scene, for a trajectory (frames, n, ...). A load has the shape
+            (k,).
 
         Raises:
-            InputError: the name is unknown, or the state is not one of this simulation.
+            InputError: the name is unknown, or the state does not belong to this simulation.
         """
         check_readable(name, "quantity", self.initial.names)
         if not isinstance(of, Trajectory):
@@ -307,7 +321,7 @@ class Simulation(Stepping):
 
     @in_turn
     def evaluator(self) -> QuantityEvaluator:
-        """Return the object that computes quantities of states on the device, which is made once."""
+        """Return the object that computes quantities of states on the device."""
         made: QuantityEvaluator | None = self.__dict__.get("_evaluator")
         if made is None:
             spacing, support = self.scene.discretisation.spacing, self.lattice.support
@@ -317,28 +331,29 @@ class Simulation(Stepping):
 
     def renderer(self, **settings: Any) -> Renderer:
         """Return a differentiable renderer of this simulation: ``renderer.render(trajectory[k])`` returns a picture.
-        The scene's table ``[render]`` sets the view; by default the camera looks from above, and in 2-D at the plane.
+        The scene's table ``[render]`` sets the view. By default the camera looks down from above, and in 2-D at the
+        plane.
 
-        ``settings`` replace keys of that table: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
-        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for settings that do not fit.
+        ``settings`` replace keys of ``[render]``: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
+        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for invalid settings.
         """
         return scene_renderer(self, **settings)
 
     def picture(self, frame: Frame, **settings: Any) -> ShadedPicture:
-        """Return a shaded picture of a frame, (rows, columns, 3), linear from 0 to 1, with the settings of the scene's
-        table ``[picture]``. ``settings`` replace keys of this table, as in `film`: ``width=640, height=360``.
+        """Return a shaded picture of a frame, (rows, columns, 3), with linear values from 0 to 1. The scene's table
+        ``[picture]`` contains the settings. ``settings`` replace keys of this table: ``width=640, height=360``.
 
         Raises:
-            SceneError: the settings do not fit. InputError: the quantity that ``colour`` names is not recorded in the
-            frame, or is the age, which needs more than one frame.
+            SceneError: settings are invalid.
+            InputError: the quantity of ``colour`` is not recorded in the frame. The age needs several frames.
 
         Example: ``cortado.pictures.write_picture("last.png", simulation.picture(trajectory[-1]))``
         """
         return on_top("simulation_picture")(self, frame, settings)
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
-        """Render a film of a ``trajectory`` on the simulation's device and write it to ``path``; for ``settings`` see
-        `Trajectory.film`. If the quantity of ``colour``, such as the pressure, was not recorded, it is computed."""
+        """Render a film of a ``trajectory`` on the device of the simulation and write it to ``path``. For ``settings``
+        see `Trajectory.film`. A quantity of ``colour`` that was not recorded, such as the pressure, is computed."""
         return on_top("simulation_film")(self, trajectory, path, settings)
 
     @property
@@ -347,12 +362,12 @@ class Simulation(Stepping):
 
     @unwarned()
     def batch_of(self, size: int) -> "Simulation":
-        """Return a simulation of ``size`` copies of this scene in one launch."""
+        """Return a simulation of ``size`` copies of this scene that are computed together."""
         return Simulation(*self._made_of(self.precision.name, size))
 
     @unwarned()
     def in_precision(self, precision: str) -> "Simulation":
-        """Return a single simulation of this scene, on the same device, in a ``precision``."""
+        """Return a simulation of a single copy of this scene in a new ``precision``, on the same device."""
         return Simulation(*self._made_of(precision, None))
 
     def replaced(self, *overrides: str) -> "Simulation":
@@ -361,8 +376,8 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """Return how many runs of ``steps`` steps one launch should compute: they fit half of the free memory, with at
-        most ``checkpoints`` bytes of stored states in total."""
+        """Return the number of runs of ``steps`` steps that should be computed together. They fit into half of the free
+        memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
         neighbours, real = build.first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
         states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)
@@ -371,16 +386,18 @@ class Simulation(Stepping):
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Return the value of every parameter of `Problem` in the scene and its forces, without the scene's
-        schedule."""
+        """Return the value of every parameter of `Problem` in the scene and its forces. The schedule of the scene is
+        ignored."""
         return scene_values(self, self.known)
 
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
-        """Return the number of explicit diffusion substeps per ``time_step`` [s] that is stable with a ``mobility``
-        [m2/s], an ``interface_width`` [m] and a ``rest_density`` (phases,) [kg/m3]; raises `InputError` for more than
-        `cortado.sph.free_energy.MOST_SUBSTEPS`."""
+        """Return the stable number of explicit diffusion substeps in each ``time_step`` [s].
+
+        ``mobility`` is in m2/s, ``interface_width`` in m, and ``rest_density`` (phases,) in kg/m3. Raises `InputError`
+        for more than `cortado.sph.free_energy.MOST_SUBSTEPS`.
+        """
         if len(self.scene.phase) == 1:
             return 0
         numbers = (float(time_step), float(mobility), float(interface_width), rest_density)

@@ -1,8 +1,8 @@
 """Cortado as a layer of PyTorch: see `docs/torch.md`.
 
-States are dictionaries of tensors by the names of their fields, in the simulation's precision and on its device, with
-their ``time`` [s]; parameters are dictionaries with the names of `Problem`. All functions support forward and reverse
-mode and `torch.vmap`; second derivatives raise an error.
+States are dictionaries of tensors by field name, with their ``time`` [s]. The tensors have the simulation's precision
+and are on its device. Parameters are dictionaries with the names of `Problem`. All functions support forward mode,
+reverse mode and `torch.vmap`; second derivatives raise an error.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,6 @@ from cortado.simulation import Simulation
 __all__ = ["Steps", "measure", "picture", "restart_state", "rollout", "smoothed", "state", "step", "value"]
 
 Tensors = Mapping[str, Any]
-"""Tensors by name."""
 _BRIDGE = TorchBridge()
 measure = bound(user_functions.measure, _BRIDGE, __name__)
 picture = bound(user_functions.picture, _BRIDGE, __name__)
@@ -33,7 +32,8 @@ value = bound(user_functions.value, _BRIDGE, __name__)
 
 
 class Steps(torch.nn.Module):
-    """A PyTorch module that runs ``steps`` steps of a simulation whose parameters are trained."""
+    """A PyTorch module that runs ``steps`` steps of a simulation. Its parameters are trained parameters of the
+    simulation."""
 
     def __init__(
         self,
@@ -42,8 +42,8 @@ class Steps(torch.nn.Module):
         trained: Values | None = None,
         gradient: AdjointEstimator | None = None,
     ):
-        """Make the module. ``trained``: first values of the trained parameters by name, such as ``{"viscosity": 0.1}``;
-        ``gradient`` is as in `step`."""
+        """Make the module. ``trained`` are the initial values of the trained parameters by name, such as
+        ``{"viscosity": 0.1}``. ``gradient`` is as in `step`."""
         super().__init__()
         layer = user_functions.steps_layer(simulation, steps, gradient)
         self.simulation, self.steps, self.gradient = simulation, steps, gradient
@@ -52,7 +52,7 @@ class Steps(torch.nn.Module):
         self._names = tuple(made)
 
     def forward(self, given: Tensors, parameters: Tensors | None = None) -> dict[str, "torch.Tensor"]:
-        """Return the state after the steps; ``parameters`` are further parameters that are not trained."""
+        """Return the state after the steps. ``parameters`` are additional parameters, which are not trained."""
         own = {name: self.trained[_key(name)] for name in self._names}
         for name in parameters or {}:
             if name in own:
@@ -61,7 +61,6 @@ class Steps(torch.nn.Module):
 
 
 def _key(name: str) -> str:
-    """Return the name of a parameter in PyTorch, which allows no points in names."""
     return name.replace(".", "/")
 
 

@@ -1,3 +1,3 @@
-"""The version of Cortado; its public name is `cortado.__version__`."""
+"""The version of Cortado."""
 
 __version__ = "0.2.0"

@@ -1,4 +1,4 @@
-"""Record quantities and read sensors during a run."""
+"""Records quantities and reads sensors during a run."""
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
@@ -21,14 +21,14 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
 class Watch:
-    """An observer of one rollout, which records quantities and reads sensors. User-defined sensors and quantities use
-    the arrays of a second solver of the scene."""
+    """An observer of a rollout that records quantities and reads sensors. User-defined sensors and quantities use the
+    arrays of a second solver of the scene."""
 
     def __init__(
         self, simulation: Any, rollout: Rollout, record: Iterable[str] = (), sensors: Mapping[str, Sensor] | None = None
     ):
-        """Watch a rollout of a `Simulation`, which imports this module. Raise `InputError` for unknown quantities, and
-        for a batch with user-defined sensors."""
+        """Watch a rollout of a `Simulation`. Raise `InputError` for unknown quantities, and for a batch with
+        user-defined sensors."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
 
@@ -61,8 +61,8 @@ class Watch:
     def run(
         self, is_frame: Callable[[int], bool], record: Observer, observe: Callable[[int], object] | None = None
     ) -> State:
-        """Run the rollout forward and return its last state. ``record`` receives frames, and ``observe`` the number of
-        each state. States computed before a `DivergedError` or an interrupt are still read."""
+        """Run the rollout forward and return its last state. ``record`` is called with each frame, and ``observe`` with
+        the number of each state. States before a `DivergedError` or an interrupt are still read."""
 
         def look(step: int, state: State) -> None:
             if is_frame(step):
@@ -92,7 +92,8 @@ class Watch:
         self._step(0, self._rollout.initial)
 
     def frame(self, step: int, state: State) -> Arrays:
-        """Return recorded quantities of the state after ``step`` steps; NaN if the next step loses a particle."""
+        """Return the recorded quantities of the state after ``step`` steps. They are NaN if the next step loses a
+        particle."""
         if not self.names:
             return {}
         found, real = dict[str, NDArray](), self._rollout.solver.discretisation.precision.numpy
@@ -112,7 +113,6 @@ class Watch:
                 self._logs[0].read(name, step, partial(value_of, sensor, at))
 
     def end(self, state: State) -> None:
-        """Read the last state of a finished run, which no step follows."""
         if self._reader is None:
             return
         step = self._rollout.taken
@@ -135,7 +135,7 @@ class Watch:
         return self._logs[0].known(readings)
 
     def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Take over ``readings`` of an earlier process, up to the state after ``steps`` steps."""
+        """Take over the ``readings`` of an earlier process. ``steps`` is the number of steps of the earlier process."""
         self._logs[0].go_on(steps, readings)
 
     def readings(self, member: int = 0) -> dict[str, Readings]:

@@ -1,5 +1,5 @@
-"""The certificate of a problem's gradients: if they are right, up to which step they are useful, and which estimator to
-use for longer runs."""
+"""The certificate of a problem's gradients. It says whether the gradients are right, up to which step they are useful,
+and which estimator suits longer runs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -48,15 +48,15 @@ from cortado.simulation import Simulation
 
 Random = np.random.Generator
 BESIDE = 0.1 * PERTURBATION
-"""Size of random changes of the first positions, in spacings, and of the first velocities, relative to the speed of a
-fall. They take fluid at rest off kinks of the loss, such as that of |v| at 0."""
+"""Size of random changes of the initial positions [spacings] and initial velocities [speeds of a fall]."""
 ROUGHLY = 0.1
-"""Greatest accepted relative difference between the adjoint of a float32 loss and finite differences of its values."""
+"""Greatest accepted relative difference between the adjoint and the finite differences of a float32 loss."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: if the adjoint is right, how many steps it is useful for, and the estimator to use."""
+    """The result of `certify`: whether the adjoint is right, for how many steps it is useful, and which estimator to
+    use."""
 
     particles: int
     steps: int
@@ -64,24 +64,25 @@ class Certificate:
     """Time step of the run [s]."""
     loss: float
     loss_changes: dict[str, float]
-    """Change of the loss by a meaningful perturbation of each parameter, the adjoint times the perturbation."""
+    """Predicted change of the loss for a meaningful perturbation of each parameter."""
     consistency: Consistency
-    """Check of the derivatives with respect to all parameters together."""
+    """Comparison of the derivatives by reverse mode, forward mode and finite differences, for all parameters
+    together."""
     wrong: tuple[str, ...]
-    """Parameters with a wrong derivative; empty if the adjoint is right."""
+    """Names of the parameters with a wrong derivative. Empty if all derivatives are right."""
     norms: np.ndarray
-    """Norms (steps + 1,) of the exact adjoint of the state after each number of steps."""
+    """Norm of the exact adjoint of the state after each step (steps + 1,)."""
     growth: float
-    """Growth of the exact adjoint's norm in each step backwards, in e-folds."""
+    """Growth of the adjoint's norm in each backward step [e-folds]."""
     horizons: tuple[Horizon, ...]
-    """Horizon of every requested parameter; empty if the adjoint is wrong."""
+    """Horizon of each requested parameter. Empty if the adjoint is wrong."""
     alignment: Alignment | None
-    """Comparison of each estimator's gradient with the smoothed gradient, for all requested parameters together; None
-    without a smoothed gradient."""
+    """Comparison of each estimator's gradient with the smoothed gradient, or None without a smoothed gradient."""
     beside: Consistency | None = None
-    """Check with slightly moved particles if the loss has a corner at the first state; otherwise None."""
+    """Comparison of the derivatives after small random moves of the particles. None unless the loss has a corner at the
+    initial state."""
     beyond: tuple[str, ...] = ()
-    """Sentences on open questions, because a copy of the run lost a particle."""
+    """Sentences on questions that remain open because a particle was lost."""
 
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
@@ -116,8 +117,6 @@ class Certificate:
         return "\n".join(lines)
 
     def _changes(self) -> Iterator[tuple[str, str, str]]:
-        """Yield each parameter with its change of the loss, marked as extrapolated unless the horizon reaches the last
-        step, and the verdict."""
         tried = {one.parameter for one in self.horizons if one.lasts}
         for name, share in self.loss_changes.items():
             verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
@@ -128,17 +127,17 @@ class Certificate:
 
     @property
     def right(self) -> bool:
-        """True if every adjoint is right."""
+        """True if all derivatives are right."""
         return not self.wrong
 
     @property
     def horizon(self) -> int:
-        """Last step up to which the exact gradient is useful for every requested parameter."""
+        """Last step up to which the exact gradient is useful for all requested parameters."""
         return min((one.measured for one in self.horizons), default=0)
 
     @property
     def estimator(self) -> str:
-        """Gradient estimator to use for these parameters and this number of steps, as written in Python."""
+        """Python code of the gradient estimator that suits the requested parameters and number of steps."""
         if not self.right:
             return "RandomizedSmoothing()"
         if all(one.lasts for one in self.horizons):
@@ -155,7 +154,7 @@ class Certificate:
         return f" with spread = { {name: float(f'{value:.3g}') for name, value in self.alignment.spread.items()} }"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the certificate as a table for JSON."""
+        """Return the certificate as a dict that can be written as JSON."""
         c, found = self.consistency, asdict(self)
         found["consistency"] |= {"disagreement": c.disagreement, "miss": c.miss, "last_converged": c.last_converged}
         for one, made in zip(self.horizons, found["horizons"], strict=True):
@@ -172,27 +171,25 @@ def certify(
     seed: int = 0,
     steps: int | None = None,
 ) -> Certificate:
-    """Check the gradients of a problem in float64; ``certify("scene.toml", steps=50)`` checks those of a scene.
+    """Check the gradients of a problem or a scene in float64.
 
-    A float32 problem is rebuilt in float64 on the same device: the code is the same, and round-off does not hide
-    errors. Your own loss is still computed in float32. Its adjoint may differ from finite differences of its values by
-    a tenth, because of float32 round-off.
+    A float32 problem is rebuilt in float64 on the same device, because round-off would hide errors. A user-defined loss
+    is still computed in float32. Its adjoint may differ from its finite differences by a tenth.
 
-    The adjoint is checked with respect to every parameter of the scene. Two things are found for ``parameters`` alone:
-    the horizon, which is the number of steps up to which the exact gradient is useful, and the estimator to use beyond
-    it. These ``parameters`` are either values by name, or names of parameters whose values the scene gives.
+    The adjoint is checked with respect to all parameters of the scene. The horizon and the recommended estimator are
+    computed for ``parameters`` only. The horizon is the number of steps up to which the exact gradient is useful.
 
     Args:
-        problem: a problem; or, with a number of ``steps``, a simulation, a scene or the path of a scene's file. The
-            loss is then the particles' mean squared distance from where they start.
-        perturbation: size of a meaningful perturbation, relative to the parameter's value; for positions relative to
-            the spacing, for velocities to the speed of a fall over the fluid's height.
-        seed: seed of the random directions. steps: number of steps; leave it out for a problem, which has its own
-        number of steps.
+        problem: a problem, a simulation, a scene, or the path of a scene file. Without a problem, ``steps`` is
+            required, and the loss is the mean squared displacement of the particles.
+        parameters: values by name, or names of parameters. Names stand for the values in the scene.
+        perturbation: size of a meaningful perturbation, relative to the parameter's value. Positions are perturbed
+            relative to the spacing, and velocities relative to the speed of a fall over the fluid's height.
+        seed: seed of the random directions.
+        steps: number of steps. It must be left out if ``problem`` is a `Problem`.
 
-    If a perturbed or float64 copy of the run loses a particle, the results cover the steps before, and
-    `Certificate.beyond` says so. Raises `InputError` for unsuitable arguments, and `DivergedError` if the problem
-    itself diverges.
+    If a particle is lost during the checks, the results cover only the earlier steps, and `Certificate.beyond` says so.
+    Raises `InputError` for unsuitable arguments, and `DivergedError` if the problem itself diverges.
 
     Example::
 
@@ -222,7 +219,7 @@ def certify(
 
 
 def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
-    """Return the certificate of a problem in float64; raise `DivergedError` if its run diverges."""
+    """Return the certificate of a float64 problem, or raise `DivergedError` if its run diverges."""
     random = np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
@@ -264,8 +261,8 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 
 
 def _problem(subject: Any, steps: int | None) -> Problem:
-    """Return a given problem; for a scene or a simulation, make a problem with the mean squared displacement of
-    particles as loss."""
+    """Return a given problem, or make a problem from a scene or a simulation. The loss of a new problem is the mean
+    squared displacement of the particles."""
     if isinstance(subject, Problem):
         if steps is not None:
             own = f"as the problem has {subject.steps} steps"
@@ -281,8 +278,8 @@ def _problem(subject: Any, steps: int | None) -> Problem:
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """Check all parameters together, and each alone if this fails; return the check and the parameters that fail
-    alone."""
+    """Check all parameters together. If this check fails, check each parameter separately. Return the check and the
+    names of the wrong parameters."""
     together = check_consistency(history, values, gradient, balanced(gradient, along))
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
@@ -291,11 +288,11 @@ def _consistency(
 
 
 def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> tuple[Consistency | None, int]:
-    """Check all parameters at slightly, randomly moved first positions and velocities. Return the check and its number
-    of steps; the check is None if the moved run loses a particle in the first step.
+    """Check the derivatives after small random changes of the initial positions and velocities. Return the check and
+    its number of steps, or None and 0 if a particle is lost at once.
 
-    Fluid at rest is at a corner of every |v| and min(v, 0), where the adjoint is a derivative to one side. Moved fluid
-    has the same terms but no corners.
+    In fluid at rest the loss may have a corner, because it contains terms such as |v|. The adjoint is then a one-sided
+    derivative.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
@@ -316,7 +313,7 @@ WIDTH = 110
 
 
 def beyond_words(horizon: Horizon) -> str | None:
-    """Return a sentence about the step after which a horizon has no result; None for a result up to the last step."""
+    """Return a sentence on the steps without a result, or None if every step has a result."""
     if horizon.reached == horizon.sample_steps[-1]:
         return None
     moved = f"a run that the perturbation of {horizon.parameter} moves"
@@ -326,8 +323,8 @@ def beyond_words(horizon: Horizon) -> str | None:
 
 
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
-    """Return words on how many digits reverse mode, forward mode and central differences have in common, and if the
-    loss has a corner."""
+    """Describe how many digits of reverse mode, forward mode and central differences agree, and whether the loss has a
+    corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"

@@ -1,4 +1,4 @@
-"""Compare the loss's derivative along a direction by reverse mode, forward mode and differences, in float64, for
+"""Compare directional derivatives of the loss by reverse mode, forward mode and finite differences, in float64 and for
 growing numbers of steps."""
 
 from collections.abc import Iterator
@@ -33,8 +33,8 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Return the problem of the first ``steps`` steps; None if no step or frame is left. A loss of the end is taken at
-    the new end, and of a `Frames` loss the frames up to the new end are kept."""
+    """Return the problem of the first ``steps`` steps, or None if no step or frame remains. A `Frames` loss is cut to
+    the frames within these steps."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -43,7 +43,7 @@ def up_to(problem: Problem, steps: int) -> Problem | None:
 
 
 def first_rows(problem: Problem, values: Arrays, steps: int) -> Arrays:
-    """Cut parameters over time to the rows of the first ``steps`` steps."""
+    """Cut parameters that vary over time to their values in the first ``steps`` steps."""
     known = problem.simulation.known
     over_time = {name for name, value in values.items() if name in known.over_time and value.ndim > known[name].rank}
     return {name: value[:steps] if name in over_time else value for name, value in values.items()}
@@ -54,8 +54,7 @@ ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
 
 
 def in_float64(problem: Problem) -> Problem:
-    """Return a problem with the same scene, device, steps and loss in float64. A loss that is not Cortado's gets states
-    rounded to float32 (`Rounded`), because it may work in float32 alone."""
+    """Return the problem in float64. A user-defined loss is wrapped in `Rounded`, because it may need float32."""
     single = problem.simulation
     if single.precision == FLOAT64:
         return problem
@@ -74,7 +73,7 @@ def _loss_in_float64(loss: Any, single: Simulation) -> Any:
 
 
 class Rounded:
-    """A wrapper of a loss that rounds float64 states to float32."""
+    """A wrapper that passes float64 states to a loss as float32."""
 
     def __init__(self, loss: Any, single: Simulation):
         self._loss, self._single = as_loss(loss), single
@@ -101,16 +100,15 @@ class Rounded:
 
 SAMPLE_STEPS = 25
 ROUGH = (1e-1, 1e-2, 1e-3)
-"""Steps h of central differences of a loss in float32, in units of the direction."""
+"""Step sizes of the central differences of a float32 loss, relative to the direction."""
 FLOAT32_ROUND_OFF = 1e-6
-"""Relative round-off of a loss in float32."""
 ABOVE_ROUND_OFF = 30.0
-"""Least ratio of a difference of float32 losses to their round-off."""
+"""Least usable difference between two float32 losses, relative to their round-off."""
 
 
 class LossHistory:
-    """A problem whose loss is also computed at earlier steps, the sample steps, as if the run ended there. A loss of
-    several frames (`Frames`) is sampled at its frames, as the sum over frames up to the sample step."""
+    """A problem with its loss after several numbers of steps, as if the run ended there. A `Frames` loss is evaluated
+    at the steps of its frames."""
 
     def __init__(self, problem: Problem):
         loss, steps = problem.loss, problem.steps
@@ -119,14 +117,15 @@ class LossHistory:
         spread = range(steps + 1) if every else np.linspace(0, steps, SAMPLE_STEPS + 1).round().astype(int)
         self.problem = problem
         self.sample_steps = np.array(sorted(frames) if frames else list(spread)[min(1, steps) :])
-        """(sample_steps,) numbers of steps after which the loss is computed; the last is the problem's."""
+        """Numbers of steps (sample_steps,) after which the loss is computed."""
         by_step = {int(m): frames[m] if frames else loss for m in self.sample_steps}
         self._losses = {m: one if isinstance(one, Rounded) else as_loss(one) for m, one in by_step.items()}
         self._total = np.cumsum if frames else np.asarray
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return central differences (sample_steps,) of step h along a direction, NaN after a run diverges, and the
-        distances of the two one-sided differences, 0 for float32 losses. ``losses`` are the unperturbed losses."""
+        """Return the central differences (sample_steps,) with step size ``h``, and the distances (sample_steps,)
+        between the two one-sided differences. Central differences are NaN after a run diverges. The distances are 0 for
+        float32 losses."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -138,9 +137,8 @@ class LossHistory:
         return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
-        """Return the relative difference between the adjoints of `Rounded` losses and finite differences of their
-        values: the smallest over steps h of the median over sample steps. The result is 0 if no loss is `Rounded`, or
-        if round-off is as large as the differences."""
+        """Return the relative difference between the adjoints and the finite differences of a float32 loss. The result
+        is the median over the sample steps, with the best step size at each sample step."""
         if not any(isinstance(loss, Rounded) for loss in self._losses.values()):
             return 0.0
         found = np.full((len(ROUGH), len(self.sample_steps)), np.inf)
@@ -154,8 +152,8 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """Yield the loss at every sample step, and the states with parameters moved by -h and h along the direction,
-        until one of the two runs diverges."""
+        """Run with the parameters changed by ``-h`` and by ``h`` times the direction. Yield the loss and the two states
+        at each sample step, until a run diverges."""
         behind, ahead = (
             self._reached({**parameters, **{name: parameters[name] + step * d for name, d in along.items()}})
             for step in (-h, h)
@@ -165,7 +163,8 @@ class LossHistory:
                 yield loss, behind[step], ahead[step]
 
     def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
-        """Return the states at the sample steps before a run loses a particle; empty if the run cannot begin."""
+        """Return the states at the sample steps, up to the loss of a particle. The dict is empty if the run cannot
+        begin."""
         try:
             return self.problem.states(parameters, self._losses)
         except NO_RUN as error:
@@ -178,8 +177,8 @@ class LossHistory:
         return shorter.states(first_rows(problem, parameters, last), steps)
 
     def tangent(self, parameters: Arrays, along: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return losses and their derivatives along a direction (sample_steps,), and the difference (sample_steps,) [m]
-        between the position tangents of a particle and of its nearest neighbour, root mean square over particles."""
+        """Return three arrays (sample_steps,): the losses, their derivatives along a direction, and the strain [m]. The
+        strain is the root mean square difference between the tangents of nearest neighbours' positions."""
         dots: dict[int, Arrays] = {}
         dimension = self.problem.simulation.dimension
 
@@ -200,8 +199,8 @@ class LossHistory:
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """Return the change of a loss between two states: the mean of its two adjoints times the difference of the states.
-    The change is exact to second order and avoids the round-off of the loss's values."""
+    """Return the change of a loss between two states, from the mean of the adjoints at the two states. This
+    second-order formula avoids the round-off of the losses."""
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
@@ -219,25 +218,24 @@ def _strain(positions: np.ndarray, dot: np.ndarray) -> float:
 
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
-"""Steps h of the central differences, in units of the direction, tried until differences stop converging and agree with
-forward mode."""
+"""Step sizes of the central differences, relative to the direction, in the order of use."""
 MODE_TOLERANCE = 1e-8
 """Greatest accepted relative difference between reverse and forward mode in float64."""
 PLATEAU = 1e-3
-"""Relative difference up to which central differences with two successive steps h count as converged."""
+"""Relative difference below which central differences with two successive step sizes count as converged."""
 CORNER = 1e-4
-"""Least relative difference of the slopes to the two sides of a corner of the loss."""
+"""Least relative difference between the two one-sided slopes at a corner of the loss."""
 SLACK = 10.0
-"""Greatest accepted distance of forward mode from a central difference, divided by the least distance of two successive
-differences."""
+"""Greatest accepted distance of forward mode from a central difference, relative to the distance between two successive
+central differences."""
 RESOLUTION = 1e-6
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 FAINT = 1e-4
-"""Part of the strongest parameter's effect on the loss below which `balanced` ignores a parameter."""
+"""Least effect of a parameter on the loss that `balanced` considers, relative to the strongest parameter's effect."""
 ROUND_OFF = 1e-13
-"""Part of the loss below which derivatives along the direction count as 0."""
+"""Directional derivative that counts as 0, relative to the loss."""
 DIFFERENCE_ROUND_OFF = 1e-15
-"""Round-off of a central difference of step h, relative to the loss divided by h."""
+"""Round-off of a central difference, relative to the loss divided by the step size."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -249,21 +247,22 @@ class Consistency(ShortRepr):
     losses: np.ndarray
     """Losses (sample_steps,)."""
     adjoint: float
-    """Derivative of the last loss by reverse mode: gradient times direction, summed over all numbers."""
+    """Directional derivative of the last loss by reverse mode."""
     size: float
-    """Root of the sum of squared products gradient times direction, which is the scale of round-off in their sum."""
+    """Norm of the elementwise product of gradient and direction. It is the scale of round-off in ``adjoint``."""
     tangents: np.ndarray
-    """Derivatives (sample_steps,) by forward mode."""
+    """Directional derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps); no rows if reverse and forward mode already differ."""
+    """Central differences (tried, sample_steps), for each step size. Empty if reverse and forward mode already
+    differ."""
     sides: np.ndarray
-    """Distances (tried, sample_steps) between the two one-sided differences."""
+    """Distances (tried, sample_steps) between the two one-sided differences, for each step size."""
     steps: np.ndarray
-    """Steps h (tried,) of the differences, in units of the direction."""
+    """Step sizes (tried,) of the differences, relative to the direction."""
 
     @property
     def disagreement(self) -> float:
-        """Relative difference between reverse and forward mode; 0 if both are below round-off."""
+        """Relative difference between reverse and forward mode, or 0 if all derivatives are below round-off."""
         last, least = float(self.tangents[-1]), ROUND_OFF * abs(float(self.losses[-1]))
         size = max(abs(self.adjoint), abs(last), self.size)
         distance = abs(self.adjoint - last) / size if size > least else 0.0
@@ -271,52 +270,52 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative differences (tried - 1, sample_steps) between central differences with successive h, each the
-        greatest up to its sample step, with round-off added."""
+        """Relative differences (tried - 1, sample_steps) between central differences with successive step sizes, plus
+        round-off. Each value is the maximum over the sample steps so far."""
         round_off = DIFFERENCE_ROUND_OFF * np.abs(self.losses).max() / self.steps[1:, None]
         return self._worst(np.abs(np.diff(self.differences, axis=0)) + round_off)
 
     @property
     def misses(self) -> np.ndarray:
-        """Relative distances (tried, sample_steps) of central differences from forward mode, each the greatest up to
-        its sample step."""
+        """Relative distances (tried, sample_steps) of the central differences from forward mode. Each value is the
+        maximum over the sample steps so far."""
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
     def corner(self) -> np.ndarray:
-        """Least relative distances over h (sample_steps,) between the two one-sided differences, each the greatest up
-        to its sample step. For small h they vanish, except at a corner of the loss."""
+        """Relative distances (sample_steps,) between the two one-sided differences, as the minimum over the step sizes.
+        The distance is about 0 unless the loss has a corner."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
     def is_on_a_corner(self) -> bool:
-        """True if reverse and forward mode agree, and one-sided differences have two different limits up to the last
-        converged step."""
+        """True if the loss has a corner: reverse and forward mode agree, but the one-sided differences have different
+        limits."""
         slopes = self.corner[self.converged]
         return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
     @property
     def converged(self) -> np.ndarray:
-        """Mask (sample_steps,) of the steps up to which differences with two successive h agree."""
+        """Mask (sample_steps,) of the sample steps at which the central differences converge."""
         return np.asarray(self.gaps.min(axis=0, initial=np.inf) < PLATEAU)
 
     @property
     def last_converged(self) -> int | None:
-        """Last sample step at which differences converge; None if they never converge."""
+        """Last sample step at which the differences converge, or None."""
         return int(self.sample_steps[self.converged][-1]) if self.converged.any() else None
 
     @property
     def miss(self) -> float | None:
-        """Relative distance of forward mode from the nearest difference at the last converged step; None without
-        convergence."""
+        """Least relative distance of forward mode from a central difference at the last converged sample step,
+        or None."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
     def differences_agree(self) -> bool:
-        """True if forward mode is near a central difference at every sample step at which differences converge.
+        """True if forward mode agrees with the central differences wherever the central differences converge.
 
-        Near means within `SLACK` times the least distance of two successive differences or, at a corner of the loss,
-        within the distance between its sides.
+        The allowed distance is `SLACK` times the least distance of two successive differences. At a corner of the loss
+        it is the distance between the two one-sided differences.
         """
         allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
         near = self.misses.min(axis=0, initial=np.inf) <= np.maximum(allowed, self.corner)
@@ -324,7 +323,7 @@ class Consistency(ShortRepr):
 
     @property
     def right(self) -> bool:
-        """True if reverse mode agrees with forward mode, and forward mode agrees with differences."""
+        """True if reverse mode, forward mode and finite differences agree."""
         return self.disagreement < MODE_TOLERANCE and self.differences_agree
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
@@ -335,9 +334,8 @@ class Consistency(ShortRepr):
 
 
 def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
-    """Scale directions so that each parameter changes the loss by 1 to 2 times the weakest parameter's change. A
-    parameter with a much larger effect then cannot hide an error in another adjoint; two wrong signs cannot cancel,
-    because no two effects are equal."""
+    """Scale the directions so that all parameters change the loss by similar amounts. A strong parameter then cannot
+    hide an error in the adjoint of a weak parameter, and two errors cannot cancel."""
     changes = {name: abs(float((gradient[name] * along).sum())) for name, along in directions.items()}
     finite = [change for change in changes.values() if np.isfinite(change)]
     strongest = max(finite, default=0.0)
@@ -351,7 +349,8 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
 
 
 def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays) -> Consistency:
-    """Compare reverse mode's ``gradient`` along a direction with forward mode and central differences."""
+    """Compare the directional derivatives by reverse mode, forward mode and central differences. ``gradient`` is the
+    result of reverse mode."""
     losses, tangents, _ = history.tangent(values, along)
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])
     found: list[tuple[np.ndarray, np.ndarray]] = []

@@ -1,5 +1,4 @@
-"""Find up to how many steps the exact gradient predicts meaningful perturbations, and which estimators help in longer
-runs."""
+"""Find the number of steps up to which exact gradients are useful, and the estimators for longer runs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -18,12 +17,12 @@ from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Parameter, Range, Role
 
 PERTURBATION = 0.05
-"""Size of a meaningful perturbation, relative to the parameter's value or, for states, to scales of the flow
-(`scales`)."""
+"""Size of a meaningful perturbation, relative to the parameter's value. Positions and velocities are perturbed relative
+to the spacing and to the speed of a fall."""
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
-    """Return the values of parameters, from a table of values or from names of the scene's parameters."""
+    """Return the values of parameters, given as a table of values or as names."""
     simulation = problem.simulation
     if problem.state is not None:
         raise InputError(
@@ -54,8 +53,8 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Return the values of all parameters that have an effect and can be both increased and decreased, with a row for
-    each step if they are over time. Values are the chosen ones, or those of the scene and its schedule."""
+    """Return the values of all parameters that affect the run and can be both increased and decreased. Missing values
+    come from the scene. Parameters over time have a value for each step."""
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
     for name, value in values.items():
@@ -72,13 +71,12 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
 
 
 def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
-    """Test if all numbers of a parameter lie inside its range, not at a bound."""
     return parameter.range is not Range.NOT_NEGATIVE or bool((value > 0.0).all())
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
-    """Return the size of a meaningful perturbation of these parameters, in their shapes and units: the fraction
-    ``perturbation`` of the value, for positions of the spacing, for velocities of the speed of a fall."""
+    """Return the size of a meaningful perturbation of each parameter, in the parameter's shape and unit. The size is a
+    fraction of the parameter's value, of the spacing, or of the speed of a fall."""
     known = problem.simulation.known
     return {
         name: np.broadcast_to(perturbation * known[name].change(problem.simulation, value), value.shape)
@@ -87,7 +85,8 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return a random direction of the given size for every parameter; a single number increases."""
+    """Return a random direction of the given size for each parameter. The direction of a scalar parameter is
+    positive."""
     return {
         name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
         for name, value in values.items()
@@ -95,8 +94,8 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions that are smooth in space and constant in time, or growing in time for a path that begins
-    at 0. Independent random numbers for each particle would only move neighbours against each other."""
+    """Return random directions that are smooth in space and constant in time. If the first position of a path is fixed,
+    the direction grows from 0."""
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
@@ -115,9 +114,8 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Return the growth of an adjoint from the last state to the first, in e-folds, by a line fitted to the logarithm
-    of its norm. The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the duration T of the run, because v^ grows linearly in
-    free flight."""
+    """Return the growth of an adjoint from the last state to the first [e-folds], from a line fitted to the logarithm
+    of ``norms``."""
     steps = len(norms) - 1
     total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
     there = np.flatnonzero(total > 0.0)
@@ -131,12 +129,13 @@ def growth(norms: np.ndarray, time_step: float) -> float:
 WITHIN = 0.25
 """Greatest relative difference between a useful exact derivative and the finite difference."""
 LINEAR = 0.3
-"""Relative displacement of neighbours up to which their forces depend on it almost linearly [spacings]."""
+"""Greatest relative displacement of neighbours in a good linear approximation of their forces [spacings]."""
 
 
 @dataclass(frozen=True, repr=False)
 class Horizon(ShortRepr):
-    """The loss's derivative along a meaningful perturbation of one parameter, exact and by a finite difference."""
+    """The directional derivatives of the loss for a meaningful perturbation of one parameter: exact and by a finite
+    difference."""
 
     parameter: str
     sample_steps: np.ndarray
@@ -144,26 +143,26 @@ class Horizon(ShortRepr):
     exact: np.ndarray
     """Derivatives (sample_steps,) by forward mode."""
     difference: np.ndarray
-    """Central differences (sample_steps,) over the full perturbation; NaN after one of their two runs diverges."""
+    """Central differences (sample_steps,) over the full perturbation. They are NaN after one of the runs diverges."""
     strain: np.ndarray
-    """(sample_steps,) change of the distance of nearest neighbours by the perturbation, to first order [spacings]"""
+    """First-order change of nearest neighbours' distances by the perturbation (sample_steps,) [spacings]."""
 
     @property
     def meaningful(self) -> np.ndarray:
-        """Mask (sample_steps,) of the steps at which the exact derivative is near the finite difference."""
+        """Mask (sample_steps,) of the sample steps at which the exact derivative is near the finite difference."""
         return np.abs(self.exact - self.difference) <= WITHIN * np.maximum.accumulate(np.abs(self.difference))
 
     @property
     def measured(self) -> int:
-        """Last sample step such that the exact derivative is useful there and at the sample step before; 0 without
-        one."""
+        """Last sample step at which the exact derivative is useful, and was useful at the previous sample step. 0
+        without any."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
     @property
     def reached(self) -> int:
-        """Last sample step with a finite difference; 0 without one."""
+        """Last sample step with a finite difference, or 0."""
         there = np.flatnonzero(~np.isnan(self.difference))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 
@@ -174,7 +173,7 @@ class Horizon(ShortRepr):
 
     @property
     def predicted(self) -> int | None:
-        """First sample step at which the perturbation separates neighbours by more than `LINEAR`; None without one."""
+        """First sample step at which the strain exceeds `LINEAR`, or None."""
         beyond = np.flatnonzero(self.strain > LINEAR)
         return int(self.sample_steps[beyond[0]]) if beyond.size else None
 
@@ -187,34 +186,33 @@ def horizon(history: LossHistory, values: Arrays, name: str, perturbation: np.nd
 
 
 MOST_NUMBERS = 12
-"""Greatest number of components for a smoothed gradient; each component costs two runs per sample."""
+"""Greatest number of components of a smoothed gradient. Each component costs two runs per sample."""
 SAMPLES = 2
 LEAST_COSINE = 0.5
-"""Least cosine with the smoothed gradient of a recommended estimator."""
+"""Least cosine between a recommended estimator's gradient and the smoothed gradient."""
 GOOD_COSINE = 0.95
-"""Cosine below which ensemble averages are tried too, at ten times the cost."""
+"""Cosine below which ensemble averages are also tried. They cost ten times as much."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
 AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
     "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
     "Guided(spread)": lambda spread: Guided(spread, seed=1),
 }
-"""Ensemble estimators that `docs/gradients.md` found best; their random numbers differ from those of the smoothed
-gradient."""
+"""Ensemble estimators to try. They use different random numbers than the smoothed gradient."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """An estimator's gradient compared with the smoothed gradient, both scaled by the meaningful perturbation."""
+    """The gradient of an estimator compared with the smoothed gradient."""
 
     estimator: str
-    """Estimator as written in Python, after ``gradients.``."""
+    """Python code of the estimator, without the prefix ``gradients.``."""
     cosine: float
     size: float
-    """Norm of the gradient divided by that of the smoothed gradient."""
+    """Norm of the gradient divided by the norm of the smoothed gradient."""
 
     @property
     def merit(self) -> float:
-        """Cosine divided by the factor by which the gradient is too large or too small; 1 is perfect."""
+        """Cosine divided by the factor between the two gradients' sizes. A perfect gradient has the merit 1."""
         return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
 
 
@@ -224,18 +222,18 @@ class Alignment:
     """Relative standard error of the smoothed gradient."""
     estimators: tuple[Judged, ...]
     spread: Mapping[str, float] = field(default_factory=dict)
-    """Spreads by parameter of the smoothed gradient and of averages."""
+    """Spread of the smoothed gradient and of ensemble averages, by parameter name."""
 
     @property
     def best(self) -> Judged | None:
-        """Estimator other than `Exact` with the greatest merit; None if no cosine is large enough."""
+        """Estimator with the greatest merit, except `Exact`. None if all cosines are too small."""
         good = [judged for judged in self.estimators[1:] if judged.cosine > LEAST_COSINE]
         return max(good, key=lambda judged: judged.merit, default=None)
 
 
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
-    """Compare estimators' gradients with the smoothed gradient, for all parameters together. Return None if there are
-    too many components for a smoothed gradient, if its runs fail, or if the loss does not depend on the parameters."""
+    """Compare the gradients of estimators with the smoothed gradient, for all parameters together. Returns None if the
+    parameters have too many components, if a run fails, or if the loss does not depend on the parameters."""
     if sum(value.size for value in values.values()) > MOST_NUMBERS:
         return None
     spread = {name: float(size.mean()) for name, size in sizes.items()}

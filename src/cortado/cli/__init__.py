@@ -1,7 +1,7 @@
-"""The command line; ``cortado`` alone shows what it can do.
+"""The command line. ``cortado`` without arguments shows what it can do.
 
-Exit codes: 0 done, 1 the computation failed (or a check did), 2 the input is wrong, 130 interrupted. A mistake of the
-user's, or of the machine, is one sentence on stderr, never a traceback.
+Exit codes: 0 for success, 1 if the computation or a check failed, 2 for wrong input, 130 after an interruption. Errors
+are printed to stderr as one sentence, without a traceback.
 """
 
 from cortado.cli.process import main

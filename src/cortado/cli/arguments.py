@@ -1,4 +1,4 @@
-"""Turn functions into commands; arguments that several commands share; and the command line as the user typed it."""
+"""Turn functions into commands, and define arguments that several commands share."""
 
 import io
 import sys
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from cortado.runs.recording import FrameChoice
 
 Work = Callable[[], str]
-"""Runs a command with parsed arguments and returns the text to print."""
+"""A function that runs a command with parsed arguments and returns the text to print."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Task = Annotated[Positional[Path], arg(metavar="TASK.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
-"""An option without a value, whose default the help does not show."""
+"""A command-line option without a value."""
 Overrides = Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="KEY=VALUE")]
 Device = Annotated[str, arg(help='"cpu", or "cuda:0" for the first GPU.')]
 Precision = Annotated[str, arg(help='"float32" or "float64".')]
@@ -37,12 +37,12 @@ Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="
 Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
 
 STEPS = 200
-"""Number of steps of a run if the user sets neither steps nor a time."""
+"""Number of steps of a run if the user gives neither a number of steps nor a time."""
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Return a decorator that turns a function into a command of a group, with an option --quiet, which hides the
-    printed text unless the command ``answers``."""
+    """Return a decorator that adds a function to a group of commands. The option --quiet hides the printed text, unless
+    ``answers`` is true."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -73,16 +73,15 @@ class Program:
     app: SubcommandApp
     description: str
     overview: Callable[[], str] | None = None
-    """Returns the text that the program prints without arguments; if None, it prints its help."""
+    """Function that returns the text to print without arguments, or None to print the help."""
 
     def parsed(self, arguments: Sequence[str]) -> Any:
-        """Parse the arguments and return what their command has to do; print help or a complaint, and exit, for other
-        arguments."""
+        """Parse the arguments and return the function that runs the command. Exit after printing help or an error."""
         config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
         return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
 
     def completion_script(self, shell: str) -> str:
-        """Return the completion script of a shell; bash completes file names where no command or option fits."""
+        """Return the completion script for a shell."""
         box = io.StringIO()
         with redirect_stdout(box), suppress(SystemExit):
             self.parsed(["--tyro-print-completion", shell])
@@ -91,12 +90,12 @@ class Program:
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Options that choose which states of a run are recorded as frames of its trajectory."""
+    """Options that choose which states of a run are recorded."""
 
     record_every: int | None = None
-    """Steps from one frame of the trajectory to the next; 1 if left out, and in a sweep a 100th of all steps."""
+    """Steps from one recorded frame to the next; 1 by default, and in a sweep a 100th of all steps."""
     fps: float | None = None
-    """Frames of the trajectory per simulated second (not of a film); instead of --record-every."""
+    """Recorded frames per simulated second, instead of --record-every; films have a separate setting."""
 
     def check(self) -> None:
         if self.fps is not None and self.record_every is not None:
@@ -104,7 +103,7 @@ class FrameOptions:
         require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":
-        """Return the choice of frames: by default one every ``otherwise`` steps."""
+        """Return the choice of frames. Without options, every ``otherwise``-th step is recorded."""
         from cortado.runs.recording import EverySteps, FramesPerSecond
 
         return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
@@ -115,12 +114,12 @@ ALL_FRAMES = FrameOptions()
 
 @dataclass(frozen=True)
 class Where:
-    """The options --scheduler and --workers of a command; `InputError` for both together, or for too many processes."""
+    """The options --scheduler and --workers of a command. Raises `InputError` if both options are given, or for too
+    many workers."""
 
     scheduler: str | None = None
-    """The address of a Dask scheduler."""
+    """Address of a Dask scheduler."""
     workers: int | None = None
-    """Number of worker processes on this machine."""
 
     def __post_init__(self) -> None:
         if self.scheduler is not None and self.workers is not None:
@@ -132,13 +131,12 @@ class Where:
 
     @property
     def option(self) -> str | None:
-        """Name of the option that the user set."""
         return "--scheduler" if self.scheduler is not None else None if self.workers is None else "--workers"
 
     @contextmanager
     def executor(self, device: str, items: int) -> "Iterator[Executor]":
-        """Yield the executor for ``items`` computations: a Dask scheduler, workers until the block ends, or this
-        process. On GPUs each worker has a separate GPU."""
+        """Yield the executor for ``items`` computations: a Dask scheduler, local worker processes, or this process.
+        Each worker on GPUs gets its own GPU."""
         from cortado.executors import Distributed, InProcess, local_workers
 
         if self.scheduler is not None:
@@ -156,7 +154,7 @@ HERE = Where()
 
 
 def require_shared(out: Path, what: str) -> None:
-    """Raise `InputError` if a worker process cannot see the folder that the command works in."""
+    """Raise `InputError` if worker processes cannot access the folder ``out``."""
     if not (out / LOCK).exists():
         raise InputError(f"A worker does not see {out}, but {what} must be in a file system that all machines share.")
 
@@ -172,7 +170,8 @@ def require_one_of_both(resume: bool, overwrite: bool) -> None:
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, by default `STEPS`, or None with a time [s]; raise `InputError` for both."""
+    """Return the number of steps, by default `STEPS`, or None if a time [s] is given. Raises `InputError` if both are
+    given."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:
@@ -183,15 +182,13 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
 
 
 def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the overrides of --set for a file as text. Raise `SceneError` for an unreadable file or an unknown key,
-    before the command's imports, which take a second."""
+    """Return the values of --set as text. Raises `SceneError` if the file is unreadable or has no such key."""
     words = as_text(overrides)
     read_toml(file, words)
     return words
 
 
 def as_text(options: Sequence[str]) -> list[str]:
-    """Return the values of --set or --only; raise `InputError` if a value is not valid text."""
     for option in options:
         try:
             option.encode()
@@ -201,5 +198,4 @@ def as_text(options: Sequence[str]) -> list[str]:
 
 
 def command_line() -> list[str]:
-    """Return the command line as the user typed it."""
     return ["cortado", *sys.argv[1:]]

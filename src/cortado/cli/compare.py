@@ -1,5 +1,5 @@
-"""``cortado compare`` compares two runs, or a run's sensors with measured data; ``cortado convergence`` several
-runs."""
+"""The commands ``cortado compare`` and ``cortado convergence``. ``compare`` compares two runs, or a run with measured
+data. ``convergence`` compares several runs."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -21,9 +21,9 @@ from cortado.runs.sensor import measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
 IGNORED = ("command", "started", "resumed", "settings", "kind")
-"""Keys of environment.json that differ between any two runs, or that are compared separately."""
+"""Keys of environment.json that are not compared here."""
 SAME_TIME = 1e-9
-"""Relative difference below which two times count as equal: sums of different step lengths have round-off."""
+"""Relative difference below which two times count as equal."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
@@ -33,7 +33,6 @@ SAME_MASS = 0.005
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
-    """Return what is equal and what differs in two runs, as text or as JSON."""
     one, other = RunFolder.open(first), RunFolder.open(second)
     here, there, *scenes = (
         _table(read_json(path)) if path.exists() else {}
@@ -71,7 +70,7 @@ def _table(value: Any) -> dict[str, Any]:
 
 
 def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a note if line k of the metrics belongs to a different time in each run; empty if the times are equal."""
+    """Return a note if the two runs have metrics at different times, or an empty dict."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
     same = steps[0] == steps[1] and (steps[0] != "auto" or scenes[0] == scenes[1])
     if same or any(table["kind"] != "run" for table in settings):
@@ -81,7 +80,7 @@ def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -
 
 
 def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
-    """Return the number of the first line that differs, and the greatest difference of each metric over all lines."""
+    """Return the first line with different metrics, and the greatest difference of each metric over all lines."""
     rows, others = one.read_metrics(), other.read_metrics()
     found: dict[str, Any] = {} if len(rows) == len(others) else {"lines": [len(rows), len(others)]}
     pairs = [(k, row, twin) for k, (row, twin) in enumerate(zip(rows, others, strict=False)) if row != twin]
@@ -97,7 +96,7 @@ def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Compare the fields of the last frames of equal time; None if a run has no frames."""
+    """Compare the fields of the last two frames at the same time. Returns None if a run has no frames."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -132,7 +131,6 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
 
 
 def _at_one_time(one: Any, other: Any) -> Any:
-    """Test whether times [s] are equal except for round-off, element by element for arrays."""
     return np.isclose(one, other, rtol=SAME_TIME, atol=0.0)
 
 
@@ -177,7 +175,7 @@ def _metric_line(metrics: Mapping[str, Any]) -> str:
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
-    """Compare a run's sensors with measured data, as text or as JSON, and plot them into the run's figures folder."""
+    """Compare a run's sensors with measured data, and plot them into the run's figures folder. Returns text or JSON."""
     folder = RunFolder.open(run)
     readings = folder.read_sensors()
     if not readings:
@@ -200,7 +198,7 @@ def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
 
 class Resolved:
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
-        """Read a run and compute the user's ``quantities``; raise `InputError` if it failed or has not ended."""
+        """Read a run and compute the user's ``quantities``. Raises `InputError` if the run failed or has not ended."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but each RUN must be one.")
@@ -208,10 +206,10 @@ class Resolved:
         last, self.path, self.scene = trajectory[-1:], folder.path, read_json(folder.scene)
         self.precision = read_json(folder.environment).get("settings", {}).get("precision", "")
         self.end = float(last.times[0])
-        """[s]"""
+        """End time of the run [s]."""
         masses = last.constants["reference_density"].astype(np.float64)
         self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
-        """[kg], in 2-D of a layer 1 m thick"""
+        """Mass of the fluid [kg]. In 2-D it is the mass of a layer 1 m thick."""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
         if self.scene.get("emitter") or self.scene.get("drain"):  # in which particles rest far from the fluid
             masses = masses * is_out(folder.read_scene(), last[0].others, len(masses))
@@ -223,10 +221,10 @@ class Resolved:
                 unit = readings[name].units[column]
                 numbers |= {f"{name} {column}": (unit, found["last"]), f"{name} {column}, mean": (unit, found["mean"])}
         self.numbers = numbers | {one.name: ("", one(trajectory)) for one in quantities}
-        """Unit and value of each result, by name."""
+        """Results of the run by name, each with its unit and value."""
 
     def size(self, key: str) -> float:
-        """Return the spacing [m] or the time step [s]; raise `InputError` if the solver chooses the time steps."""
+        """Return the spacing [m] or the time step [s]. Raises `InputError` if the solver chooses the time steps."""
         table, name = key.split(".")
         value = self.scene[table][name]
         if not isinstance(value, float | int):
@@ -235,7 +233,7 @@ class Resolved:
 
 
 def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
-    """Return the table of convergence, as text or as JSON; raise `InputError` for runs that cannot be compared."""
+    """Return the convergence table as text or as JSON. Raises `InputError` for runs that cannot be compared."""
     own = [OwnQuantity(one) for one in quantities]
     runs = [Resolved(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST_RUNS:
@@ -270,7 +268,8 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
-    """Return the key in which runs differ: spacing or time step. Raise `InputError` if other keys differ too."""
+    """Return the key that varies between the runs: spacing or time step. Raises `InputError` if any other key
+    varies."""
     changed: set[str] = set()
     for run in runs[1:]:
         changed |= differences(runs[0].scene, run.scene).keys()
@@ -307,33 +306,34 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
 
 
 LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
-"""Range in which the observed order is searched."""
+"""Range of possible orders of convergence."""
 LOWEST, HIGHEST = 0.5, 2.0
-"""Range of trusted orders: the methods have orders from 1 to 2."""
+"""Range of trusted orders of convergence."""
 ROUND_OFF = 1e-6
-"""Relative tolerance at both ends of the trusted range of orders."""
+"""Relative tolerance at the ends of the trusted range."""
 SAFE, UNSURE = 1.25, 3.0
-"""Safety factors of Roache (1994): for three sizes with a trusted order, and for all other cases."""
+"""Safety factors of Roache (1994): with three sizes and a trusted order, and without."""
 
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """An extrapolation of a number f(h) = limit + C h^order from its values at the three finest sizes h.
+    """The extrapolation of a result to the limit of vanishing spacing or time step. The model is f(h) = limit + C
+    h^order for the value f at the size h, with an unknown constant C. It is fitted to the three finest sizes.
 
     Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911), 307; the grid convergence index of P. J. Roache, J.
-    Fluids Eng. 116 (1994), 405, by the procedure of I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001, for sizes
-    whose ratios differ. Without an observed order, the error is three times the greatest difference (L. Eca and M.
-    Hoekstra, J. Comput. Phys. 262 (2014), 104).
+    Fluids Eng. 116 (1994), 405; for sizes with different ratios, I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001.
+    Without an observed order, the error is three times the greatest difference: L. Eca and M. Hoekstra, J. Comput.
+    Phys. 262 (2014), 104.
     """
 
     order: float | None
-    """Observed order; None if the values have no order."""
+    """Observed order of convergence, or None if the values do not converge."""
     limit: float | None
-    """Limit in the values' unit, computed with the observed order clipped to `LOWEST` and `HIGHEST`."""
+    """Limit for vanishing size, or None. The order is clipped to the range from `LOWEST` to `HIGHEST`."""
     error: float | None
-    """Estimated error of the value at the finest size, in its unit, times a safety factor. None if a value is NaN."""
+    """Estimated error of the value at the finest size, including a safety factor. None if a value is NaN."""
     flag: str = ""
-    """Reason why no order is observed or why the observed order is not trusted; empty in the asymptotic range."""
+    """Reason for a missing or untrusted order. Empty in the asymptotic range."""
 
     @classmethod
     def of(cls, sizes: Sequence[float], values: Sequence[float]) -> "Extrapolation":

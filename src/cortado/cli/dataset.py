@@ -1,4 +1,4 @@
-"""``cortado dataset``: compute many runs of a scene with varied values, and write files in LagrangeBench's layout."""
+"""The command ``cortado dataset``, which computes many runs of a scene and writes the files of LagrangeBench."""
 
 import json
 import warnings
@@ -33,13 +33,13 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 ASKED = "dataset.json"
-"""File with the settings of a data set, without the number of runs; a command with other settings is refused."""
+"""File name of the settings of a data set."""
 MOST_RUNS = 100_000
 
 
 @dataclass(frozen=True)
 class Member:
-    """Computes one run of a data set in a worker process."""
+    """A function that computes one run of a data set in a worker process."""
 
     file: Path
     overrides: tuple[str, ...]
@@ -54,7 +54,7 @@ class Member:
         )
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
-        """Compute a run and write it; return whether it succeeded, and its warnings."""
+        """Compute and write a run. Return whether it succeeded, and its warnings."""
         require_shared(self.out, "the scene and the folder of a data set")
         folder = DatasetFolder(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():
@@ -70,8 +70,8 @@ class Member:
 
 
 def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str, precision: str, where: Where) -> str:
-    """Compute the missing runs of a new or existing data set, and write its files; return a sentence that names the
-    folder. Raise `ComputationError` if the disk is full, or if training, validation or test has no run."""
+    """Compute the missing runs of a data set, write its files, and return a sentence that names the folder. Raises
+    `ComputationError` if the disk is full, or if training, validation or test has no run."""
     table = _table(file, words)
     of_scene = [one for one in words if one not in overrides_of(words, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
@@ -128,7 +128,7 @@ def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str
 
 @contextmanager
 def _saying(kept: Callable[[], str]) -> Iterator[None]:
-    """Add the sentence ``kept`` to the message of an interruption or of an error of the disk."""
+    """Add the sentence ``kept()`` to the error message of an interruption or a full disk."""
     try:
         with keeping(kept):
             yield
@@ -137,7 +137,8 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
-    """Write the files of the data set and return the metadata; raise `ComputationError` if a purpose has no run."""
+    """Write the files of the data set and return the metadata. Raises `ComputationError` if training, validation or
+    test has no run."""
     folder = DatasetFolder(member.out)
     there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
     for purpose, numbers in split.items():
@@ -163,7 +164,7 @@ def _table(file: Path, overrides: list[str]) -> DatasetTable:
 
 
 def _asked(member: Member) -> dict[str, Any]:
-    """Return the settings of a data set; read its first scene and those at the ends of ranges to find mistakes."""
+    """Return the settings of a data set. Scenes at the ends of the ranges are read to find mistakes early."""
     table = member.table
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
@@ -191,8 +192,8 @@ def _asked(member: Member) -> dict[str, Any]:
 
 
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
-    """Write the settings of a data set into its folder, and remove unfinished files of a killed process. Raise
-    `InputError` if the folder contains anything else."""
+    """Write the settings into the folder of the data set and remove unfinished files. Raises `InputError` if the folder
+    contains unknown files."""
     note = out / ASKED
     for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
         left_behind.unlink(missing_ok=True)

@@ -1,5 +1,5 @@
-"""``cortado describe``: estimate the cost of a run before it starts. ``cortado gradients check``: compute the
-certificate of a scene's gradients."""
+"""The commands ``cortado describe`` and ``cortado gradients check``. ``describe`` estimates the cost of a run, and
+``gradients check`` computes the certificate of a scene's gradients."""
 
 import json
 import math
@@ -43,19 +43,19 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
 
 MANY = 1_000_000
-"""Number of particles from which on a note is printed, because making them takes seconds or minutes."""
+"""Number of particles above which a note about the waiting time is printed."""
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
-"""Least and greatest number of steps that are timed, and the total time [s] after which timing stops."""
+"""Least and greatest number of timed steps, and sufficient time for timing [s]."""
 SAME = 1e-6
-"""Relative difference that rounding a time step to float32 can cause."""
+"""Relative tolerance for time steps that are rounded to float32."""
 MOST_FRAMES = 1_000_000
-"""Greatest number of frames of a film."""
 HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
-"""Measured bytes of a trajectory file without frames: headers, constants per particle, diagnostics per step."""
+"""Sizes in a trajectory file [bytes]: headers, constants of a particle, and diagnostics of a step."""
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Return the number of timed steps and the time of one [s]; raise `DivergedError` if the scene diverges."""
+    """Time a few steps, and return their number and the time of one step [s]. Raises `DivergedError` if the scene
+    diverges."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -72,17 +72,17 @@ def measured_speed(simulation: Simulation) -> tuple[int, float]:
 
 
 class RunLength:
-    """The length of a run, given as a number of steps or as a time, with its frames and its film."""
+    """The length of a run and of its film."""
 
     def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
         self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
-        """Number of steps; an estimate if the run ends at a given time and the solver chooses the steps."""
+        """Number of steps. It is an estimate if the solver chooses the time steps of a run until a given time."""
         self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
-        """Simulated time [s]; None for a number of steps whose lengths the solver chooses."""
+        """Simulated time [s], or None if the solver chooses the time steps of a given number of steps."""
         self.frames = frames = choice.count(self.steps, time)
-        """Number of recorded frames, including first and last; None if it depends on an unknown time."""
+        """Number of recorded frames, including the first and last state, or None if it is unknown."""
         self.trajectory: float | None = None
         """Size of the recorded frames on disk [bytes]."""
         if frames is not None:
@@ -90,7 +90,7 @@ class RunLength:
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
             self.trajectory = size + (HEADS + PER_PARTICLE * simulation.particles + PER_STEP * self.steps)
         self.film: Pace | None = None
-        """None without a film or if the film's length is unknown."""
+        """Frames of the film, or None without a film or for an unknown length."""
         if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
             times = np.linspace(0.0, time, frames)
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
@@ -126,7 +126,7 @@ def describe_scene(
     picture: Path | None,
     as_json: bool,
 ) -> str:
-    """Describe a scene as text or as JSON; write a picture of the first state if ``picture`` is a path."""
+    """Describe a scene as text or as JSON. If ``picture`` is a path, a picture of the initial state is drawn there."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     of_search = overrides_of(overrides, ("problem", "optimise")) if "optimise" in read_toml(scene_file) else []
@@ -203,7 +203,8 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the time step [s], its limits [s] by name, and the limit that sets the first step (None if fixed)."""
+    """Return the time step [s], its limits [s] by name, and the limit of the first step. For fixed time steps the last
+    value is None."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -218,14 +219,14 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
 
 
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Return when an emitter is empty (None if never), its drains, its speed, and the areas of cells and opening."""
+    """Describe an emitter: when it is empty, its drains, its speed, and the areas of its cells and opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
 
 
 def seconds_of_picture(simulation: Simulation, quality: str) -> float | None:
-    """Measure the time [s] to draw the first state on all cores in a given quality; None if no fluid is visible."""
+    """Measure the time to draw the initial state on all cores [s]. Returns None if no fluid is visible."""
     scene, positions = simulation.scene, simulation.positions[: simulation.free_particles or None]
     scene = scene.model_copy(update={"picture": (scene.picture or Picture()).model_copy(update={"quality": quality})})
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[: len(positions)]
@@ -240,7 +241,8 @@ def seconds_of_picture(simulation: Simulation, quality: str) -> float | None:
 
 
 def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, float]:
-    """Estimate the memory [bytes] of a forward run, and of one with its gradient and a checkpoint of every step."""
+    """Estimate the memory of a forward run and the memory of a run with its gradient [bytes]. A checkpoint of every
+    step is assumed."""
     particles, walls, real = simulation.particles, len(simulation.walls), simulation.precision.bytes
     solver = simulation.solver
     assert isinstance(solver, ParticleSolver)
@@ -300,7 +302,6 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _emitter(found: dict[str, Any], dimension: int, length: RunLength) -> str:
-    """Describe an emitter's speed and the time when it is empty."""
     given, asked, dry = found["area"], found["area_asked"], found["runs_dry_at_s"]
     lasts = "never runs dry" if dry is None else f"has fluid for {dry:.4g} s"
     if found["fed_by"]:
@@ -329,7 +330,8 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Describe the film's frames and length, and its drawing times, given the times of single pictures [s]."""
+    """Describe the frames and length of a film, and the time to draw it. ``traced`` and ``quick`` are the times of one
+    picture [s]."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:
@@ -341,7 +343,6 @@ def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """Return a time as text, in the unit that suits: seconds up to days."""
     for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * size:
             return f"about {seconds / size:.2g} {unit}"
@@ -369,7 +370,7 @@ def check_scene(
     as_json: bool,
     seed: int,
 ) -> str:
-    """Compute the certificate of a scene's gradients as text; raise `ComputationError` if an adjoint is wrong."""
+    """Return the certificate of a scene's gradients as text. Raises `ComputationError` if a derivative is wrong."""
     if loss not in LOSSES:
         raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
     scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))

@@ -1,5 +1,4 @@
-"""``cortado picture`` and ``cortado export`` of existing runs; user-defined functions of runs; the runs that arguments
-name."""
+"""The commands ``cortado picture`` and ``cortado export`` for existing runs, and user-defined quantities of runs."""
 
 import csv
 import json
@@ -29,12 +28,12 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 SWEEP = "sweep.csv"
-"""File name of the table of a sweep."""
+"""File name of a sweep's table."""
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
-    """Return the runs in the given folders; a sweep's folder stands for all of its runs, in the order of its table. A
-    folder without a run raises `InputError`."""
+    """Return the runs in the given folders, and all runs of a given sweep. Raises `InputError` for a folder without a
+    run."""
     if not folders:
         raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
     found: list[RunFolder] = []
@@ -51,10 +50,11 @@ def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
 
 
 class OwnQuantity:
-    """A user's function of a trajectory that returns a number."""
+    """A user-defined function of a trajectory that returns a number."""
 
     def __init__(self, where: str):
-        """Run the file in ``FILE.py:FUNCTION``; raise `InputError` if it fails or does not define the function."""
+        """Load the function from ``FILE.py:FUNCTION``. Raises `InputError` if the file fails or does not define the
+        function."""
         file, _, name = where.rpartition(":")
         if not file.endswith(".py") or not name.isidentifier():
             raise InputError(f"--quantity is {shown(where)}, but must be FILE.py:FUNCTION.")
@@ -67,7 +67,8 @@ class OwnQuantity:
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
-        """Return the number of a trajectory; raise `InputError` if the function fails or returns no number."""
+        """Return the function's value for a trajectory. Raises `InputError` if the function fails or returns
+        no number."""
         try:
             found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
@@ -81,12 +82,11 @@ class OwnQuantity:
 
 
 def _told(problem: Exception) -> str:
-    """Return the class and the message of an error, on one line."""
     return " ".join(f"{type(problem).__name__}: {problem}".split()).rstrip(".")
 
 
 def camera_override(camera: str | None) -> list[str]:
-    """Convert ``--camera`` to an override, which comes before those of ``--set`` so that they can add to it."""
+    """Convert ``--camera`` to an override. It must come before the overrides of ``--set``."""
     kind, _, solid = (camera or "").partition(":")
     keys = {"kind": kind, **({"solid": solid} if solid else {})}
     path = ", ".join(f"{name} = {json.dumps(value)}" for name, value in keys.items())
@@ -94,7 +94,7 @@ def camera_override(camera: str | None) -> list[str]:
 
 
 def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
-    """Read the scene of an existing run, with overridden keys of [picture]."""
+    """Read the scene of an existing run, with overrides of [picture]."""
     for override in overrides:
         if not override.startswith("picture."):
             raise InputError(
@@ -113,7 +113,7 @@ def draw_runs(
     device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
-    """Draw a frame, or a film, of one run or of several side by side; return a sentence that names the file."""
+    """Draw a picture or a film of one run, or of several runs side by side. Returns a sentence that names the file."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
@@ -161,7 +161,7 @@ def _trajectory(folder: RunFolder) -> Trajectory:
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:
-    """Write every ``every``-th frame of an existing run in format ``to``; return a sentence that names the files."""
+    """Export every ``every``-th frame of a run in the format ``to``. Returns a sentence that names the files."""
     folder = RunFolder.open(run)
     if not folder.trajectory.exists():
         raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")

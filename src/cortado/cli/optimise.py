@@ -1,7 +1,5 @@
-"""``cortado optimise``: solve the inverse problem of a task, resume the search, and judge the result.
-
-``cortado fit``: estimate parameters with error bars from measured experiments, and write a report.
-"""
+"""The commands ``cortado optimise`` and ``cortado fit``. ``optimise`` solves the inverse problem of a task, and ``fit``
+estimates parameters with error bars from measurements."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -49,7 +47,8 @@ def optimise_task(
     where: Where = HERE,
     pictures: bool = False,
 ) -> str:
-    """Optimise a task and return a sentence that names the results; ``where`` computes ensembles."""
+    """Optimise a task and return a sentence that names the results. The samples of ensembles are computed by
+    ``where``."""
     task = load_task(task_file, overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
@@ -66,7 +65,7 @@ def optimise_task(
 
 
 def search_settings(task: Task, precision: str) -> dict[str, Any]:
-    """Return the settings which, unlike iterations and check, must be the same when a search is resumed."""
+    """Return the settings that must not change when a search is resumed."""
     return {
         "precision": precision,
         "problem": task.problem.model_dump(),
@@ -75,12 +74,11 @@ def search_settings(task: Task, precision: str) -> dict[str, Any]:
 
 
 def _kept(folder: RunFolder) -> str:
-    """Say where the evaluations are stored; empty before the first evaluation."""
+    """Return a sentence that names the folder of the evaluations, or an empty text before the first evaluation."""
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
 def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pictures: bool) -> str:
-    """Run the search, judge its result and write all files; return a sentence that names the results."""
     missing = lacking(made.task.scene) if pictures else None
     if missing:
         say(missing)
@@ -118,7 +116,6 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
     with track(len(made.searches) * settings.iterations, "optimise") as advance:
 
         def show(made: int, **fields: Any) -> None:
-            """Update the progress bar after ``made`` updates of this search; an earlier search may have ended early."""
             nonlocal shown
             advance(k * settings.iterations + made - shown, **fields)
             shown = k * settings.iterations + made
@@ -250,7 +247,6 @@ def _effort(fitted: Fit) -> Section:
 
 
 def fit_for_machines(fitted: Fit, profiles: Sequence[Profile]) -> dict[str, Any]:
-    """Return the results of a fit by name, for result.json."""
     lower, upper = ({n: np.asarray(pair[k]) for n, pair in fitted.intervals().items()} for k in range(2))
     numbers = fitted.coordinates.numbers
     return {

@@ -1,4 +1,4 @@
-"""The results of ``cortado optimise`` and how well they meet the task's goals: as sentences, report and JSON."""
+"""The results of ``cortado optimise`` as text, report and JSON, with a verdict on the goals of the task."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -21,35 +21,38 @@ from cortado.scene.scene import scene_in_words
 Rows = list[tuple[object, ...]]
 
 LITTLE = 2.0
-"""Factor by which a search must reduce the loss to count as successful."""
+"""Least reduction factor of the loss in a successful search."""
 LONG = 100
-"""Number of steps from which on chaotic, useless gradients may explain an unsuccessful search."""
+"""Number of steps above which chaotic gradients may explain an unsuccessful search."""
 MOST_ERROR = 0.3
-"""Greatest relative error with which a parameter still counts as found."""
+"""Greatest relative error of a found parameter."""
 MOST_IN_RESULT = 1000
-"""Greatest size of a parameter whose estimate is written to result.json; larger ones are only in the checkpoint."""
+"""Greatest size of a parameter in result.json. The checkpoint contains all parameters."""
 VIEWED = 60
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of an optimisation compared with the goals in the table [optimise.check] of the task."""
+    """A comparison of the result of an optimisation with the goals in [optimise.check]."""
 
     first: float
     reduction: float
-    """Loss at the start / best loss; infinite if the best loss is 0."""
+    """First loss divided by the best loss, or infinity if the best loss is 0."""
     errors: dict[str, float]
-    """For each parameter the relative L2 distance of the estimate from the true value, or that from 0."""
+    """Relative L2 error of each parameter's estimate. The error is absolute where the true value is 0."""
     psnr: float | None
-    """Peak signal-to-noise ratio of the last image [dB]; None if the task compares positions."""
+    """Peak signal-to-noise ratio of the last image [dB], or None for a task without images."""
     failures: list[str]
 
 
 def judge(
     task: Task, result: Result, estimate: Arrays | None = None, noise: float | None = None, first: float | None = None
 ) -> Verdict:
-    """Judge a result by the task's [optimise.check], with the parameters, if the result has only coordinates, the peak
-    signal-to-noise ratio reached [dB], and the ``first`` loss, if the history begins with another one."""
+    """Compare a result with the goals in the task's [optimise.check].
+
+    ``estimate`` has the parameters if the result has only coordinates. ``noise`` is the peak signal-to-noise ratio of
+    the last image [dB]. ``first`` is the initial loss, if it differs from the start of the history.
+    """
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf
@@ -91,7 +94,7 @@ def asked(made: Setup) -> Section:
 
 
 class Solved:
-    """A search that has ended, judged by its task, as sentences, report and JSON."""
+    """The result of a finished search and its verdict, as sentences, report and JSON."""
 
     def __init__(self, made: Setup, result: Result):
         self.made, self.result, self.estimate = made, result, made.search.parameters(result.parameters)
@@ -118,7 +121,8 @@ class Solved:
         return f"{'; '.join([text, *reached])}."
 
     def _worst(self, name: str, error: float) -> str:
-        """Describe the worst of a parameter's few numbers, if its error exceeds twice the parameter's error."""
+        """Describe a parameter's component with the greatest error, if that error is more than twice the parameter's
+        error."""
         estimate, true = self.estimate[name], self.made.true_parameter(name)
         names = component_names(self.made.task, name, estimate)
         if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
@@ -129,7 +133,7 @@ class Solved:
 
     @property
     def advice(self) -> list[str]:
-        """Advice after too small a reduction, wrong gradients, a wrong local minimum, or an end on a bound."""
+        """Advice for a small reduction, wrong gradients, a wrong local minimum, or a result on a bound."""
         made, result, task, steps = self.made, self.result, self.made.task, self.made.task.problem.steps
         found = []
         for name, (lower, upper) in made.bounds.items():
@@ -157,7 +161,7 @@ class Solved:
         return found
 
     def _at_knots(self, name: str) -> Iterator[tuple[str, Any, Any, Any]]:
-        """Yield label, first guess, found and hidden value (or None) of each knot of a parameter."""
+        """Yield four values for each knot of a parameter: label, first guess, estimate, and hidden value or None."""
         own = self.knots[name]
         for k, time in enumerate(own.times):
             true = None if own.true is None else own.true[k]
@@ -165,7 +169,7 @@ class Solved:
 
     @property
     def lines(self) -> list[str]:
-        """A line for each parameter, or for each of its knots; parameters with very many numbers have no line."""
+        """Lines of text on the parameters or their knots. Parameters with very many components are left out."""
         lines = []
         for name, value in self.estimate.items():
             found: Iterable[Any] = [(_words(name), None, value, self.made.true_parameter(name))]
@@ -181,8 +185,7 @@ class Solved:
 
     @property
     def rows(self) -> Rows:
-        """Table rows (parameter, unit, first guess, found, hidden, error): one for each number searched, each knot, and
-        each parameter with very many numbers."""
+        """Table of the estimates, with the columns parameter, unit, first guess, found, hidden and error."""
         rows, errors, start = Rows(), self.verdict.errors, self.made.search.parameters(self.made.start)
         for name, value in self.estimate.items():
             unit, true = self.made.task.known[name].unit, self.made.true_parameter(name)
@@ -204,7 +207,6 @@ class Solved:
         return rows
 
     def sections(self, figures: TaskFigures) -> list[Section]:
-        """Return the sections of the report."""
         made, result, verdict, task = self.made, self.result, self.verdict, self.made.task
         steps, unit = made.problem.steps, "" if made.renderer else "m²"
         viewed = np.unique(np.linspace(0, steps, VIEWED).astype(int)).tolist()
@@ -236,7 +238,7 @@ class Solved:
         ]
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the results by name, for result.json."""
+        """Return the contents of result.json."""
         result, verdict, small = self.result, self.verdict, MOST_IN_RESULT
         return {
             "evaluations": len(result.history),

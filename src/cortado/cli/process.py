@@ -1,4 +1,4 @@
-"""Run a command from the command line to its exit code; a failure prints one sentence."""
+"""Run a command and exit with its exit code. A failure is printed as one sentence."""
 
 import io
 import logging
@@ -19,11 +19,10 @@ from cortado.files.terminal import Interrupted, say, tell, to_stdout
 from cortado.version import __version__
 
 BROKEN_PIPE = 141
-"""Exit code if the reader of the output has gone: that of a process ended by the signal SIGPIPE."""
+"""Exit code after a closed output pipe, as for a process ended by SIGPIPE."""
 
 
 def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> None:
-    """Run a command of a program; exit with its exit code unless it is 0."""
     arguments = sys.argv[1:] if arguments is None else arguments
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever the user has chosen for windows
     try:
@@ -57,7 +56,6 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
 
 
 def _understood(program: Program, arguments: Sequence[str]) -> Work:
-    """Parse the arguments and return what their command has to do, unless they ask for help or the version."""
     box = io.StringIO()
     try:
         with redirect_stderr(box), to_stdout():
@@ -110,11 +108,11 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*", r"\1 is \2, but must be a number"),
     (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
 )
-"""Patterns of tyro's complaints and the sentences that replace them; unknown complaints are printed unchanged."""
+"""Patterns of tyro's error messages, with replacements."""
 
 
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
-    """Replace tyro's complaint about a program's arguments, printed in a box, by a sentence."""
+    """Replace tyro's boxed error message by a sentence."""
     words = " ".join(arguments)
     lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)
@@ -129,11 +127,11 @@ def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado")
 _MEMORY = (os.strerror(ENOMEM), "failed to map segment")
 _FILES = (os.strerror(EMFILE), os.strerror(ENFILE))
 _THREADS = ("can't start new thread",)
-"""Texts that reveal a shortage: the dynamic linker raises an `ImportError`, or an `OSError` without a number."""
+"""Error texts that reveal a lack of threads."""
 
 
 def shortage(error: BaseException | None) -> str | None:
-    """Return a sentence for a lack of memory, files or threads among the causes of an error; None for others."""
+    """Return a sentence if an error was caused by a lack of memory, files or threads, or None."""
     while error is not None:
         said = str(error) if isinstance(error, OSError | ImportError | RuntimeError) else ""
         if isinstance(error, MemoryError) or any(word in said for word in _MEMORY):

@@ -1,4 +1,4 @@
-"""``cortado run``: run a scene and write its folder meanwhile, so that a stopped or killed run can be resumed."""
+"""The command ``cortado run``, which runs a scene and writes results during the run. A stopped run can be resumed."""
 
 import time
 from collections.abc import Sequence
@@ -31,25 +31,23 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""Notes are written every `OFTEN` seconds, or less often if that took more than 1 / `SHARE` of the time."""
+"""Least time between two writes of notes [s], and least ratio of this time to the writing time."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """The user's options for one run of a scene."""
-
     out: Path
     steps: int | None = None
     time: float | None = None
-    """Simulated time [s], instead of steps."""
+    """Simulated time [s], as an alternative to a number of steps."""
     overrides: Sequence[str] = ()
     device: str = "cpu"
     precision: str = "float32"
     frames: FrameChoice = field(default_factory=lambda: EverySteps(1))
     record: Sequence[str] = ()
-    """Quantities of the particles that every frame records."""
+    """Names of the particle quantities in each recorded frame."""
     state: Path | None = None
-    """A run folder or trajectory file, from whose last state the run starts."""
+    """Run folder or trajectory file with the initial state."""
     resume: bool = False
     overwrite: bool = False
     pictures: bool = False
@@ -57,7 +55,7 @@ class RunRequest:
     report: bool = True
 
     def settings(self, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
-        """Return the settings that must be unchanged when the run is resumed."""
+        """Return the settings that must not change when the run is resumed."""
         found = run_settings(rollout.steps, self.precision, self.frames)
         if np.isfinite(rollout.step_sizes.end):
             found |= {"steps": None, "time": self.time}
@@ -76,7 +74,7 @@ def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, A
 
 @dataclass
 class RunRecording:
-    """Runs a rollout and writes its frames, the solver's notes on steps, and the readings of sensors."""
+    """A rollout that writes frames, diagnostics of the time steps, and sensor readings."""
 
     simulation: Simulation
     rollout: Rollout
@@ -84,11 +82,10 @@ class RunRecording:
     frames: FrameChoice
     watch: Watch
     kept: Trajectory | None = None
-    """Frames of an earlier process; the rollout continues from the last of them."""
+    """Frames of an earlier process, from which the rollout continues."""
 
     def go_on(self) -> int:
-        """Continue from the last frame in the folder with all notes and readings up to it; return the number of steps
-        before that frame."""
+        """Continue from the last frame in the folder, and return its step number."""
         if not self.folder.trajectory.exists():
             return 0
         found, begun = Trajectory.load(self.folder.trajectory), self.rollout.clocks[0].steps
@@ -105,7 +102,7 @@ class RunRecording:
         return step
 
     def run(self) -> State:
-        """Take the steps and return the last state. Write everything before a `DivergedError`."""
+        """Take the time steps and return the last state. All results are written before a `DivergedError` is raised."""
         rollout, steps = self.rollout, self.rollout.steps
         times, first = self.frames.announced(rollout), self.simulation.frame(rollout.initial)
         constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
@@ -155,7 +152,7 @@ class RunRecording:
 
 
 class Notes:
-    """Writes sensor readings and the solver's notes at intervals during a run."""
+    """A writer of sensor readings and time step diagnostics at intervals during a run."""
 
     def __init__(self, recording: RunRecording, writer: TrajectoryWriter):
         self._recording, self._writer = recording, writer
@@ -219,7 +216,6 @@ def run_scene(scene_file: Path, asked: RunRequest) -> str:
 
 
 def _compute(recording: RunRecording, asked: RunRequest) -> None:
-    """Run a scene, print a summary, and write the folder's files, even if the run diverges."""
     simulation, rollout, folder = recording.simulation, recording.rollout, recording.folder
 
     def report(told: Section) -> None:
@@ -243,7 +239,7 @@ def _compute(recording: RunRecording, asked: RunRequest) -> None:
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
-    """Return by name the mean and the greatest value over all steps of each of the solver's notes."""
+    """Return the mean and the maximum of each diagnostic over all time steps, by name."""
     noted = {name: np.asarray(values, dtype=np.float64) for name, values in rollout.diagnostics.items() if len(values)}
     return {
         "particles": simulation.particles,

@@ -1,6 +1,6 @@
-"""The summary that ``cortado run`` prints at its end, and the report of the run.
+"""The summary that ``cortado run`` prints, and the report of the run.
 
-The report is written twice: first without shaded pictures, which take long, then with them.
+The report is written twice: at once without shaded pictures, and again when the pictures are drawn.
 """
 
 from collections.abc import Mapping
@@ -39,11 +39,11 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of the fluid [J], in 2-D of a layer 1 m thick, without particles in emitters and drains."""
+    """Energies of the fluid [J], without particles in emitters and drains. In 2-D they belong to a layer 1 m thick."""
 
     kinetic: float
     potential: float
-    """Energy in the present gravity, relative to the container's lowest corner or, without container, to the origin."""
+    """Potential energy in the current gravity, relative to the lowest corner of the container or to the origin."""
 
     @property
     def total(self) -> float:
@@ -51,7 +51,7 @@ class Energy:
 
     @classmethod
     def of(cls, simulation: Simulation, rollout: Rollout, state: State, step: int) -> "Energy":
-        """Compute the energies of a state, with the gravity of step number ``step`` (from 0)."""
+        """Compute the energies of a state, with the gravity of the given time step, counted from 0."""
         names, out = ("positions", "velocities", "reference_density"), _out(simulation, state)
         fields = {name: array[out] for name, array in state.numpy(simulation.dimension, only=names).items()}
         masses = simulation.lattice.cell * fields["reference_density"].astype(np.float64)
@@ -70,7 +70,8 @@ class RunSummary:
     def __init__(
         self, simulation: Simulation, rollout: Rollout, last: State, seconds: float, readings: Mapping[str, Readings]
     ):
-        """Summarise a run from its ``last`` state, the ``seconds`` in this process, and sensor readings by name."""
+        """Summarise a run, given its ``last`` state, the computing time ``seconds`` of this process, and the sensor
+        readings by name."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings
         self.computed = taken - rollout.progress.step  # without the steps of an earlier process
@@ -79,16 +80,16 @@ class RunSummary:
         self.first = Energy.of(simulation, rollout, rollout.initial, 0)
         self.last = Energy.of(simulation, rollout, last, taken - 1)
         self.turned = bool(np.ptp(gravity[0, :taken], axis=0).any())
-        """True if gravity changed, so that potential energies at start and end cannot be compared."""
+        """True if gravity changed during the run. The first and last potential energies are then not comparable."""
         self.densities: tuple[float, float] | None = None
-        """Least and greatest density at the end [kg/m3]; None for solvers without particles."""
+        """Least and greatest density of the last state [kg/m3], or None for solvers without particles."""
         if isinstance(solver, ParticleSolver):
             found = solver.densities(last, rollout.parameters, taken - 1)[_out(simulation, last)]
             self.densities = float(found.min()), float(found.max())
         scene, free = simulation.scene, simulation.free_particles
         self.balance = Balance.of(scene, *map(_others, (rollout.initial, last))) if scene.drain else None
         self.spilt = 0
-        """Number of particles outside an open cup, without those that began in an emitter."""
+        """Number of particles outside an open container, without particles from emitters."""
         if np.isfinite(scene.container.region(simulation.dimension).rim):
             positions = last.numpy(simulation.dimension, only=["positions"])["positions"]
             outside = ~scene.container.contains(positions[:free], TOLERANCE * scene.discretisation.spacing)
@@ -104,7 +105,7 @@ class RunSummary:
         return "all" if self.computed == self.steps else f"the last {self.computed}"
 
     def for_machines(self) -> dict[str, Any]:
-        """Return by name the numbers that are the same in every repetition of the run."""
+        """Return the reproducible results of the run, by name."""
         least, greatest = self.densities or (None, None)
         return {
             "energy": {"first": vars(self.first), "last": vars(self.last)},
@@ -190,7 +191,8 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run, with shaded ``pictures`` if wanted, the results ``told`` and sensors ``read``."""
+    """Write the report of a run. ``told`` is the section of results, and ``read`` has the sensor readings by name.
+    Shaded pictures are included if ``pictures`` is true."""
     scene, trajectory, step = simulation.scene, Trajectory.load(folder.trajectory), float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
     if scene.solver.chooses:
@@ -277,7 +279,8 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
 
 @dataclass(frozen=True)
 class Balance:
-    """Numbers of particles that entered and left: ``first`` + ``came`` = ``last`` + the sum of ``went``."""
+    """Numbers of particles that entered and left the fluid. ``first`` + ``came`` equals ``last`` + the sum of
+    ``went``."""
 
     first: int
     came: int
@@ -286,7 +289,7 @@ class Balance:
 
     @classmethod
     def of(cls, scene: Scene, first: Mapping[str, Any], last: Mapping[str, Any]) -> Self:
-        """Count the particles from the fields `Frame.others` of the first and the last frame of a run."""
+        """Count the particles, given `Frame.others` of the first and the last frame."""
         counts = {drain.name: count_name(drain.name) for drain in scene.drain}
         went = {name: int(np.ravel(last[key])[0] - np.ravel(first[key])[0]) for name, key in counts.items()}
         inside, left = (

@@ -1,4 +1,4 @@
-"""Commands that compare and show existing runs, and commands that make many runs: sweeps and data sets."""
+"""Commands that compare and show existing runs, and commands that make many runs."""
 
 from functools import partial
 from pathlib import Path
@@ -29,8 +29,7 @@ def compare(
     second: Annotated[Positional[Path], arg(metavar="RUN|DATA.csv")],
     json: Json = False,
 ) -> Work:
-    """Compare two runs: their scenes and settings, their last states, their metrics, and where they were made. Or
-    compare the sensors of a run with measured data.
+    """Compare two runs, or the sensors of a run with measured data.
 
     Args:
         first: The folder of a run.
@@ -55,7 +54,7 @@ def sweep(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
-    """Run a scene, or optimise a task, with every combination of some values, each in its own folder; finished folders
+    """Run a scene, or optimise a task, with every combination of some values, each in its own folder. Finished folders
     are kept.
 
     Args:
@@ -64,9 +63,9 @@ def sweep(
         zips: Keys that change together: the first values of all --zip make one run, the second values the next.
         steps: Number of steps with the smallest time step of the sweep, 200 if left out; all runs end at the same time.
         time: Simulated time of a scene [s], instead of steps.
-        out: Folder of the sweep, with a folder for each combination and a table of them all.
+        out: Folder of the sweep, with a folder for each combination and a table of all results.
         pictures: Leave out the figures and reports of a scene's runs, which take longer than short runs.
-        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        device: Device of each worker: "cpu", or "cuda:0" for the first GPU.
         scheduler: Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
     """
@@ -85,7 +84,7 @@ def convergence(
     quantities: Annotated[UseAppendAction[tuple[str, ...]], arg(name="quantity", metavar="FILE.py:FUNCTION")] = (),
     json: Json = False,
 ) -> Work:
-    """Compute order, limit and error of convergence from runs with different spacings or time steps.
+    """Compute the order, the limit and the error of convergence from runs with different spacings or time steps.
 
     Args:
         runs: Folders of at least three runs that end at the same time, or the folder of a sweep.
@@ -106,15 +105,15 @@ def dataset(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
-    """Compute many runs of a scene with varied values, as training data for learned simulators. The same command again
-    computes missing runs; a larger number of runs extends the data set.
+    """Compute many runs of a scene with varied values, as training data for learned simulators. Repeating the command
+    computes missing runs, and a larger number of runs extends the data set.
 
     Args:
         file: A scene file with the table [dataset], which says which values vary.
-        runs: Number of runs, including those for validation and tests.
+        runs: Number of runs, including the runs for validation and tests.
         out: Folder of the data set: train.h5, valid.h5, test.h5 and metadata.json, as LagrangeBench reads them.
         overrides: Replace a value of the file, such as dataset.steps=200; may be given again.
-        device: "cpu", or "cuda:0" for the first GPU, of each worker.
+        device: Device of each worker: "cpu", or "cuda:0" for the first GPU.
         scheduler: Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
     """
@@ -135,13 +134,13 @@ def picture(
     overrides: Overrides = (),
     device: Device = "cpu",
 ) -> Work:
-    """Draw a shaded picture, or a film, of a run that `cortado run` wrote, or of several side by side.
+    """Draw a shaded picture or a film of a run that `cortado run` wrote, or of several runs side by side.
 
     Args:
         runs: Folders of up to nine runs, or the folder of a sweep.
         frame: Number of a recorded frame; a negative number counts from the end; the last frame if left out.
-        film: Draw a film of all frames instead; after Ctrl-C the same command continues it.
-        lines: Rows of pixels, such as 720, 1080 or 2160; the picture has the ratio 16:9.
+        film: Draw a film of all frames instead; after Ctrl-C the same command continues the film.
+        lines: Height of the picture in pixels, such as 720, 1080 or 2160; the picture has the ratio 16:9.
         camera: Motion of a film's camera: "orbit", "dolly", or "follow:NAME" for a solid of that name.
         colour: Quantity that colours the fluid, such as speed, pressure, vorticity, age or phase.
         out: File to write (film: .mp4 or .webp); if left out, in the run's figures, or beside several runs.
@@ -170,13 +169,13 @@ def export(
     every: int = 1,
     overrides: Overrides = (),
 ) -> Work:
-    """Export a run of `cortado run` to other programs: its surface, particles and solids over time.
+    """Export the surface, particles and solids of a run over time for other programs.
 
     Args:
         run: The folder of the run.
         to: "usd" for one file for Blender and Houdini; "glb", "ply", "obj", or "vtp" (ParaView) for a series of files.
         out: The folder to write, empty or missing; if left out, a folder in the run's folder with the format's name.
-        every: Write every so many frames of the run, such as 2 for every second one.
+        every: Write only every n-th frame of the run, such as 2 for every second frame.
         overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
     """
     require_at_least(1, every, "--every")

@@ -1,7 +1,6 @@
-"""Commands of ``cortado`` and of ``cortado gradients``: their arguments and help texts.
+"""The commands of ``cortado`` and ``cortado gradients``, with their arguments and help texts.
 
-Commands for existing runs and for many runs are in `cortado.cli.runs_and_sweeps`. ``cortado new`` and ``cortado
-examples`` are implemented here.
+Commands for existing runs and for many runs are in `cortado.cli.runs_and_sweeps`.
 """
 
 import ast
@@ -58,13 +57,13 @@ def check(
     json: Flag = False,
     seed: int = 0,
 ) -> Work:
-    """Check a scene's gradients in float64: whether they are right, up to which step they are useful, and what to use
-    beyond.
+    """Check a scene's gradients in float64: whether they are right, up to which step they are useful, and which
+    estimator suits longer runs.
 
     Args:
         scene: The scene file.
         steps: Number of time steps.
-        parameters: Parameters whose horizon is measured; the adjoint is checked for all of them.
+        parameters: Parameters whose horizon is measured; the adjoint is checked for all parameters of the scene.
         loss: Measure of the fluid's motion: "positions" of particles, "centre-of-mass" or "image".
         perturbation: Size of a meaningful change of a parameter, relative to its value.
         out: Folder for a figure and the numbers.
@@ -86,13 +85,13 @@ app.command(gradients, name="gradients", help="Check the gradients of a scene.")
 def new(
     name: Annotated[Positional[Path], arg(metavar="NAME")], template: str = "dam", dimension: int | None = None
 ) -> Work:
-    """Write a commented scene that runs at once, and the schema with which editors check it.
+    """Write a commented scene file that can be run at once, and the schema for editors.
 
     Args:
         name: Name of the file, such as dam.toml or dam.
         template: The kind of scene: dam, baffled_tank, drop, honey, jet, moored_raft, pillar, pour, raft,
             rayleigh_taylor, shaken, stirred, stirred_tank or tap_and_drain.
-        dimension: 2 or 3, of the dam; 2 if left out.
+        dimension: Dimension of the template dam, 2 or 3; 2 if left out.
     """
     return partial(new_scene, name, template, dimension)
 
@@ -249,7 +248,7 @@ command(app)(dataset)
 
 @command(app, answers=True)
 def schema() -> Work:
-    """Print the JSON schema of scenes and tasks; editors use it to complete and check them."""
+    """Print the JSON schema of scenes and tasks, with which editors complete and check files."""
     from cortado.optimisation.task_tables import file_schema_text
 
     return lambda: file_schema_text().rstrip("\n")
@@ -257,7 +256,7 @@ def schema() -> Work:
 
 @command(app, answers=True)
 def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="SHELL")]) -> Work:
-    """Print the completion script of a shell; it is loaded by: eval "$(cortado completion bash)".
+    """Print the completion script of a shell. To load it, use: eval "$(cortado completion bash)".
 
     Args:
         shell: bash or zsh.
@@ -295,7 +294,7 @@ COMMANDS = [command for group in _GROUPS.values() for command, _ in group]
 
 
 def overview() -> str:
-    """Return the text that ``cortado`` without arguments prints: each task with an example command."""
+    """Return the text that ``cortado`` prints without arguments."""
     lines = [f"Cortado {__version__}, a differentiable SPH fluid simulator."]
     for title, entries in _GROUPS.items():
         lines += ["", f"{title}:"]
@@ -311,15 +310,14 @@ CORTADO = Program("cortado", app, SUMMARY, overview)
 
 
 DAM = "dam"
-"""The template with a comment on every line, in 2-D and in 3-D."""
+"""Name of the template with a comment on every line."""
 TEMPLATES = Path(__file__).with_name("templates")
-"""The folder of the templates: scenes whose first line says what the scene is and how to run it."""
 IN_3D = "_3d"
 SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
-"""File name in the first line, and line with the name, of a template; the name of the new file replaces both."""
+"""Placeholders in a template for the file name and for the line with the scene's name."""
 ALL = "all"
 DATA = (".csv", ".mp4")
-"""Suffixes of data files of an example; their names begin with the example's name: example_ANY.csv."""
+"""Suffixes of the data files of an example."""
 
 
 def templates() -> list[str]:
@@ -327,7 +325,7 @@ def templates() -> list[str]:
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
-    """Write a scene, and beside it the schema with which editors check it; existing files are not replaced."""
+    """Write a scene file, and the schema for editors beside it. Existing files are not replaced."""
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
@@ -349,7 +347,7 @@ def new_scene(path: Path, template: str, dimension: int | None) -> str:
 
 
 def scene_text(file: Path, template: str) -> tuple[str, str]:
-    """Return the text of a template's scene for a new ``file``, and the options for running it."""
+    """Return the text of a template for a new ``file``, and the options for running the scene."""
     text = (TEMPLATES / f"{template}.toml").read_text(encoding="utf-8")
     name = "".join(letter if letter.isprintable() and letter not in '"\\' else "_" for letter in file.name)
     own = text.replace(SCENE_FILE, name, 1).replace(SCENE_NAME, f'name = "{name.removesuffix(".toml")}"')
@@ -357,8 +355,8 @@ def scene_text(file: Path, template: str) -> tuple[str, str]:
 
 
 def list_examples(names: list[str], folder: Path) -> str:
-    """List the examples, one per line, or copy the named examples, with the files that they read, into a folder, which
-    is created if missing. If one of the files exists already, nothing is copied."""
+    """List the examples, one per line, or copy the named examples and their data files into a folder. Nothing is copied
+    if one of the files exists already."""
     found = {path.stem: path for path in sorted(examples_folder().iterdir()) if path.suffix in (".toml", ".py")}
     if not found:
         raise InputError(f"{examples_folder()} holds no examples: install Cortado again.")
@@ -389,7 +387,6 @@ def _command(path: Path) -> str:
 
 
 def _line(path: Path) -> str:
-    """Return a line with an example's name and the beginning of its description."""
     text = path.read_text("utf-8")
     if path.suffix == ".py":
         first = (ast.get_docstring(ast.parse(text)) or "").split("\n")[0]

@@ -1,4 +1,4 @@
-"""``cortado sweep``: run a scene or a task with every combination of some values, and write a table of the results."""
+"""The command ``cortado sweep``, which runs a scene or a task with all combinations of values and writes a table."""
 
 import csv
 import io
@@ -27,10 +27,9 @@ from cortado.runs.run_folder import RunFolder
 from cortado.scene.scene import load_scene, read_toml
 
 MOST_COMBINATIONS = 100_000
-"""Greatest number of combinations of a sweep; a larger number is taken for a mistake."""
 _LONGEST_NAME = 120
 _PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
-"""Folder names that need no quotes in a shell."""
+"""Pattern of folder names that need no quotes in a shell."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class Combination:
     """One value for each key of a sweep."""
 
     values: tuple[tuple[str, str], ...]
-    """Pairs (key, value as the user wrote it), in the order of the options."""
+    """Pairs of key and value, as the user wrote them."""
 
     @property
     def overrides(self) -> list[str]:
@@ -46,8 +45,8 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """The folder's name, made of the values; if these are long or have special characters, of some values and a
-        checksum. The name does not depend on the other combinations of a sweep."""
+        """Name of the folder, made from the values. A long name, or a name with special characters, is shortened and
+        ends with a checksum."""
         name = ",".join(self.overrides)
         if _PLAIN.fullmatch(name) and len(name) <= _LONGEST_NAME and not name.startswith(("-", ".")):
             return name
@@ -56,8 +55,8 @@ class Combination:
 
 
 def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Combination]:
-    """Return every combination of the values of all keys; the first key changes slowest. The k-th values of all
-    ``zipped`` keys belong to one combination; these change fastest. Wrong options raise `InputError`."""
+    """Return all combinations of the values of all keys. The first values of all ``zipped`` keys belong together, then
+    the second values, and so on. Raises `InputError` for wrong options."""
     if not options and not zipped:
         raise InputError("--set is missing, but must name what changes, such as --set solver.time_step=0.001,0.002.")
     keys, together = _values(options, "--set"), _values(zipped, "--zip")
@@ -76,7 +75,6 @@ def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Com
 
 
 def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
-    """Return the values of each key; raise `InputError`, naming the option, for wrong ones."""
     keys: dict[str, list[str]] = {}
     for option in options:
         key, equals, text = option.partition("=")
@@ -92,7 +90,6 @@ def _values(options: Sequence[str], name: str) -> dict[str, list[str]]:
 
 
 def _split(text: str) -> list[str]:
-    """Split a text at its commas, except commas within brackets or quotes."""
     parts, is_open = list[str](), False
     for piece in text.split(","):
         if is_open:
@@ -105,11 +102,12 @@ def _split(text: str) -> list[str]:
 
 
 MOST_NUMBERS = 12
-"""Greatest length of a list that the table shows; longer lists are only in the result.json of each folder."""
+"""Greatest length of a list in the table."""
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the table of folders, values and ``results``, the contents of result.json by number."""
+    """Write the table of folders, values and results. ``results`` has the contents of result.json for each
+    combination's number."""
     rows = [
         {
             "folder": combinations[number].name,
@@ -129,7 +127,8 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Flatten nested tables, joining names by full stops; lists become JSON, long lists are left out."""
+    """Flatten nested tables and join their names by full stops. Short lists become JSON, and long lists are
+    left out."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
@@ -147,20 +146,20 @@ SAME_TIME = 1e-9
 
 @dataclass(frozen=True)
 class Member:
-    """Computes one combination of a sweep in a worker process."""
+    """A function that computes one combination of a sweep in a worker process."""
 
     file: Path
     duration: float | None
-    """Duration of a scene's run [s]; None for a task, whose file gives the number of steps."""
+    """Duration of a scene's run [s], or None for a task."""
     out: Path
     device: str
     precision: str
     frames: FrameOptions
-    """Which frames are recorded; without options about a hundred."""
+    """Choice of recorded frames. The default is about a hundred frames."""
     report: bool
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
-        """Return a combination's result, as in result.json; compute it if it is missing."""
+        """Return the contents of a combination's result.json. Missing results are computed first."""
         require_shared(self.out, "the task and the folder of a sweep")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -171,8 +170,8 @@ class Member:
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
-        """Return the result of a combination; None if its run has not ended. Raise `InputError` if its scene or task is
-        wrong, or differs from the one in its folder."""
+        """Return the result of a combination, or None if its run has not ended. Raises `InputError` if the scene or
+        task is wrong, or if it differs from the file in the folder."""
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)
@@ -187,7 +186,6 @@ class Member:
         return folder.read_result()
 
     def _folder(self, combination: Combination) -> RunFolder | None:
-        """Return the run folder of a combination; None if it contains no run."""
         path = self.out / combination.name
         return RunFolder.open(path) if (path / "environment.json").exists() else None
 
@@ -197,7 +195,6 @@ class Member:
         return check_steps(max(round(self.duration / _time_step(self.file, combination)), 1))
 
     def _computed(self, combination: Combination) -> dict[str, Any]:
-        """Compute a combination, or resume its run; the result reports a failure."""
         out, overrides = self.out / combination.name, combination.overrides
         begun = self._folder(combination) is not None
         words = [str(self.file), *(word for one in overrides for word in ("--set", one)), "--out", str(out)]
@@ -239,8 +236,8 @@ def run_sweep(
     frames: FrameOptions = ALL_FRAMES,
     pictures: bool = True,
 ) -> str:
-    """Compute the missing combinations of a sweep; return a sentence that names the table. Raise `ComputationError` if
-    some combinations failed."""
+    """Compute the missing combinations of a sweep and return a sentence that names the table. Raises `ComputationError`
+    if some combinations failed."""
     chosen, duration = combinations(options, zipped), time
     if "optimise" in read_toml(file):  # a task
         for name, number in (("steps", steps), ("time", time)):
@@ -289,13 +286,12 @@ def run_sweep(
 
 
 def _time_step(file: Path, combination: Combination) -> float:
-    """Return the time step of a combination's scene [s]; its warnings are printed when it runs."""
     with unwarned():
         return load_scene(file, combination.overrides).solver.fixed_time_step("a sweep")
 
 
 def _warn_of_times(member: Member, done: list[Combination]) -> None:
-    """Warn if runs end at different times because the duration is no multiple of their time steps."""
+    """Warn if runs end at different times, because the duration is no multiple of their time steps."""
     duration = member.duration
     if duration is None or not done:
         return

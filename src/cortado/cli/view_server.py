@@ -1,12 +1,11 @@
-"""A viser server that checks who connects, and which messages a page sends.
+"""A viser server that checks the origin of connections and the messages of a page.
 
-The window's address ends in a random token, which gives access. Any page in a browser can send requests to this
-machine, with an ``Origin`` that the browser sets. A page's host name can also be made to point to this machine (DNS
-rebinding). The server refuses requests without the token, with another host name, or from another page. Programs other
-than browsers send no ``Origin`` and need only the token.
+The window's address ends in a random token. The server refuses requests without the token, with another host name, or
+with the ``Origin`` of a foreign page. The checks protect against other web pages and against DNS rebinding. Programs
+other than browsers send no ``Origin`` and need only the token.
 
-A page may send only the camera's position and valid values of controls. Viser's server accepts any value of any
-attribute of a control, and further messages, such as one that opens a tunnel to the internet; they are ignored here.
+A page may send only the position of the camera and valid values of controls. All other messages of viser are ignored,
+such as a message that opens a tunnel to the internet.
 """
 
 import logging
@@ -35,21 +34,21 @@ HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "Cache-Control": "no-store",
 }
-"""HTTP headers that keep the token from other sites, and the window out of frames in other pages."""
+"""HTTP headers that hide the token from other sites and forbid embedding the page in frames."""
 Answer = Callable[[ServerConnection, Request], Response | None]
-"""The type of ``process_request`` in websockets: it returns a page, or None to open a websocket."""
+"""Type of ``process_request`` in websockets. The function returns a page, or None to open a websocket."""
 LARGEST_NUMBER = 1e9
 LONGEST_MESSAGE = 2**16
-"""[bytes]"""
+"""Greatest length of a message [bytes]."""
 Number = Annotated[float, msgspec.Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 Direction = tuple[Number, Number, Number]
 Controls = Callable[[str], Any]
 KNOWN = "1.1.1"
-"""The only version of viser that this module can guard."""
+"""The only supported version of viser."""
 FAREWELL = 0.3
-"""Time [s] to wait for a page's answer when the window closes; a busy page does not answer."""
+"""Waiting time for a page's answer when the window closes [s]."""
 _silent = logging.getLogger(__name__)
-"""Drops messages about failed connections, which concern only the other side."""
+"""Logger that drops messages about failed connections."""
 _silent.disabled = True
 
 
@@ -71,7 +70,7 @@ class Update(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_un
 
 
 class Hearing(sockets.ServerConnection):
-    """A websocket that drops messages which a page may not send."""
+    """A websocket that drops forbidden messages from a page."""
 
     def __init__(self, *arguments: Any, controls: Controls, **options: Any):
         super().__init__(*arguments, **options)
@@ -85,7 +84,7 @@ class Hearing(sockets.ServerConnection):
 
 
 class GuardedServer:
-    """A guarded viser server on this machine; if ``port`` is taken, it uses one of the next ports."""
+    """A guarded viser server on this machine. If ``port`` is taken, the server uses one of the next ports."""
 
     def __init__(self, port: int, label: str):
         self._token, self._guarded = token_hex(16), False
@@ -117,7 +116,7 @@ class GuardedServer:
         return serve(*where, **options | own)
 
     def _answer(self, answer: Answer | None, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request, or refuse one without the token, with another host name, or from another page."""
+        """Answer a request. Requests without the token, with another host name, or from a foreign page are refused."""
         token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
         own, port = compare_digest(token.encode(errors="replace"), self._token.encode()), connection.local_address[1]
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
@@ -137,8 +136,8 @@ class GuardedServer:
 
 @contextmanager
 def _serving(serve: Callable[..., Any]) -> Iterator[None]:
-    """Let the package websockets open servers with ``serve``, whose first argument is the package's function. Viser has
-    no option for this, and a later guard would leave the first moments unguarded."""
+    """Replace the function that opens servers in websockets by ``serve``, because viser has no option for this. The
+    original function is the first argument of ``serve``."""
     usual = sockets.serve
     sockets.serve = partial(serve, usual)  # type: ignore[misc, assignment]
     try:
@@ -152,7 +151,7 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 def judged(message: bytes | str, controls: Controls) -> bytes | None:
-    """Return an accepted message, encoded anew so that viser reads what was checked; None for a refused message."""
+    """Return an accepted message, encoded again, or None for a refused message."""
     with suppress(msgspec.MsgspecError, RecursionError, TypeError):
         said = _decoder.decode(message)  # type: ignore[arg-type]  # a text is refused
         if isinstance(said, CameraMessage) or (said.updates.keys() == {"value"} and _can_be(said, controls)):
@@ -161,7 +160,7 @@ def judged(message: bytes | str, controls: Controls) -> bytes | None:
 
 
 def _can_be(said: Update, controls: Controls) -> bool:
-    """Test whether a user of the page could set a control to this value."""
+    """Test whether a user of the page could set a control to the value in the message."""
     control, value = controls(said.uuid), said.updates["value"]
     if control is None or control.disabled or not control.visible:
         return False

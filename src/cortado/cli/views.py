@@ -1,4 +1,4 @@
-"""``cortado view``: show a recorded run in the browser, or run a scene and show it live."""
+"""The command ``cortado view``, which shows a recorded run or a running scene in the browser."""
 
 import atexit
 import gc
@@ -35,9 +35,9 @@ from cortado.solvers.particles import ParticleSolver
 
 UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
 RADIUS = 0.4
-"""Radius of a drawn particle, in spacings."""
+"""Radius of a drawn particle [spacings]."""
 DISTANCE = 1.7
-"""Initial distance of the camera, in radii of the scene's contents."""
+"""Initial distance of the camera, relative to the radius of the displayed scene."""
 PALETTE = "viridis"
 BRIGHTEST = 99.5
 """Percentile of the values at the upper end of the colour scale."""
@@ -45,14 +45,14 @@ LINES = (130, 125, 118)
 THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
 
 Quantity = Callable[[], np.ndarray]
-"""Computes a quantity (n,) of the particles when the user selects it; may raise a `CortadoError`."""
+"""A function that computes a quantity (n,) of the particles. It may raise a `CortadoError`."""
 
 
 class Window:
-    """A window in the browser, served by viser; y is up, whatever the axes of the scene."""
+    """A window in the browser, served by viser. The y axis points up."""
 
     def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
-        """``units`` has the units of the quantities that can colour particles, by name, without "phase"."""
+        """Open a window. ``units`` maps the names of particle quantities to their units."""
         try:
             import viser  # noqa: F401  for the sentence
 
@@ -66,7 +66,7 @@ class Window:
         self._units = units
         self._cloud: Any = None
         self._stale = False
-        """True if the user has changed the colours and `refresh` must draw again."""
+        """True if the user has changed the colours since the last drawing."""
         self.server.scene.set_up_direction("+y")
         gui, first = self.server.gui, "phase" if len(scene.phase) > 1 else next(iter(units))  # one colour has no depth
         self.colour = gui.add_dropdown("Colour", ["phase", *units], initial_value=first)
@@ -79,19 +79,19 @@ class Window:
 
     @property
     def address(self) -> str:
-        """The address for a browser, with the token that gives access."""
+        """Address for a browser, with the token that gives access."""
         return self._guarded.address
 
     def close(self) -> None:
         self._guarded.close()
 
     def show(self, positions: Points, colours: Points, out: NDArray, quantities: Mapping[str, Quantity]) -> None:
-        """Replace the drawn particles by those that are ``out`` (n,) of emitters and drains.
+        """Draw the particles that are marked in the mask ``out`` (n,), instead of the previous particles.
 
         Args:
-            positions: (n, d) [m]; along a periodic axis particles are drawn within one period.
+            positions: (n, d) [m]. Along a periodic axis particles are drawn within one period.
             colours: (n, 3), linear.
-            quantities: functions by name, for (n,) values that can colour the particles.
+            quantities: functions by name, which return values (n,) to colour the particles.
         """
         self._drawn = np.where(out, np.arange(len(out)), np.argmax(out))  # hidden particles are drawn where one is
         self._points = self._space(self.scene.domain.wrapped(positions)[self._drawn])
@@ -119,7 +119,6 @@ class Window:
             self._cloud.points, self._cloud.colors = points, colours
 
     def _colours(self) -> np.ndarray:
-        """Return sRGB colours (n, 3); the legend shows their range, or why the quantity is not available."""
         from matplotlib import colormaps
 
         name = self.colour.value
@@ -138,11 +137,10 @@ class Window:
         return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
 
     def _space(self, points: Points) -> np.ndarray:
-        """Return points (..., d) as (..., 3) float32, with y up."""
         return np.asarray(in_space(np.asarray(points, np.float32) @ self._turn.T.astype(np.float32)))
 
     def _draw_solid(self, name: str, solid: ShownSolid) -> Any:
-        """Draw edges of a solid, and in 3-D faces unless it is a tank; return viser's frame, which has its pose."""
+        """Draw the edges of a solid, and its faces in 3-D. Tanks have no faces. Returns viser's frame of the solid."""
         pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
         frame = self.server.scene.add_frame(name, show_axes=False, **pose)
         self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(solid))), LINES, **THIN)
@@ -155,7 +153,7 @@ class Window:
         return frame
 
     def look_at(self, positions: Points) -> None:
-        """Place the camera to show container and solids, or else the particles at ``positions`` (n, d) [m]."""
+        """Point the camera at the container and the solids. Without them, point it at ``positions`` (n, d) [m]."""
         lines = self._space(outline(self.scene)).reshape(-1, 3)
         points = lines if len(lines) else self._space(positions)
         lower, upper = points.min(axis=0), points.max(axis=0)
@@ -189,8 +187,8 @@ def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> 
 def quantities_of(
     velocities: np.ndarray, simulation: Callable[[], Simulation], state: RestartState, controls: Mapping[str, Any]
 ) -> dict[str, Quantity]:
-    """Return functions, by name, for quantities of particles with velocities (n, d) [m/s] in a state under
-    ``controls``. Computing any of them except the speed may raise `InputError`."""
+    """Return functions that compute particle quantities of a state, by name. ``velocities`` has the shape (n, d) [m/s].
+    The functions may raise `InputError`, except the function of the speed."""
 
     def density() -> np.ndarray:
         rollout = simulation().rollout(1, controls, state)
@@ -216,13 +214,13 @@ def sizes_of(values: np.ndarray) -> np.ndarray:
 
 
 STRIDE = 1.0 / 100.0
-"""Approximate simulated time [s] between two pictures."""
+"""Approximate simulated time between two pictures [s]."""
 SHORTEST_PAUSE = 1.0 / 40.0
-"""Shortest real time [s] between two pictures."""
+"""Shortest real time between two pictures [s]."""
 LEAN = 2.0
-"""Ends of the gravity sliders, relative to the size of the scene's gravity."""
+"""Greatest gravity on the sliders, relative to the scene's gravity."""
 SHORTEST_PLAY = 4.0
-"""Least time [s] that a run takes to play at pace 1."""
+"""Least duration of the playback at normal pace [s]."""
 
 
 class RecordedView:
@@ -309,7 +307,6 @@ class LiveView:
         time.sleep(max(SHORTEST_PAUSE - (time.monotonic() - begun), 0.0))
 
     def _begin(self) -> None:
-        """Show the first state, and set the sliders to the scene's values."""
         self._wish_to_begin = False
         scene = self.simulation.scene
         self._outlets = {emitter.name: np.array(emitter.outlet) for emitter in scene.emitter}
@@ -335,7 +332,8 @@ class LiveView:
         self.window.show(state["positions"], colours, is_out(scene, state.fields, particles), quantities)
 
     def _controls(self) -> dict[str, np.ndarray]:
-        """Return the controls of the next steps: gravity, and each nozzle's straight path to its sliders' place."""
+        """Return the controls of the next steps: gravity, and a straight path from each nozzle to its slider
+        position."""
         controls = {"gravity": np.array([slider.value for slider in self.gravity])}
         share = np.arange(1, self.steps + 1)[:, None] / self.steps
         for name, sliders in self.nozzles.items():
@@ -345,7 +343,6 @@ class LiveView:
         return controls
 
     def _sliders(self, title: str, unit: str, values: Any, ends: Any) -> list[Any]:
-        """``ends`` (2, d)."""
         found = []
         for axis, value, *ends_of_axis in zip("xyz", values, *ends, strict=False):
             least, greatest = map(float, ends_of_axis)
@@ -354,7 +351,7 @@ class LiveView:
         return found
 
     def _reach(self, emitter: EmitterTable) -> np.ndarray:
-        """Return the ends (2, d) of a nozzle's range [m]: above the container, at about the nozzle's present height."""
+        """Return the range of a nozzle's sliders (2, d) [m], which is above the container."""
         outlet, ends, half = np.array(emitter.outlet), self.simulation.scene.container.extent(), 0.5 * emitter.width
         if ends is None:
             return outlet + np.array([[-20.0], [20.0]]) * half
@@ -366,7 +363,6 @@ class LiveView:
 
 
 def view(path: Path, overrides: list[str], device: str, precision: str | None, port: int) -> str:
-    """Show a run folder, or run and show a scene, until Ctrl-C."""
     shown = opened(path, overrides, device, precision, port)
     say(f"{shown.window.address} shows it; Ctrl-C ends it.")
     atexit.register(gc.freeze)  # the garbage collection at exit would take as long as the rest

@@ -1,4 +1,4 @@
-"""The device layer: precisions, launches, compiling, memory, threads, and processes that share work."""
+"""The device layer: precisions, kernel launches, compilation, memory, threads, and worker processes."""
 
 from typing import TYPE_CHECKING
 

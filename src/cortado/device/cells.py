@@ -1,7 +1,7 @@
-"""A counting sort of particles by the cells of a grid, scene after scene of a batch.
+"""A counting sort of particles by the cells of a grid, for each scene of a batch.
 
 The grid wraps around in every direction, so that every position has a cell. Along a periodic axis the cells divide the
-period; along other axes a distance test rejects particles of cells that wrapping identifies.
+period. Along other axes distant particles may share a cell, and a distance test rejects them.
 """
 
 from functools import cache, partial
@@ -16,21 +16,21 @@ from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName, struct_of
 
 FURTHEST = 2.0**24
-"""Greatest distance of a position from the grid [cells]; particles further away count as lost."""
+"""Greatest distance of a position from the grid [cells]. Particles further away count as lost."""
 
 
 @cache
 def cell_grid_type(precision: Precision) -> Any:
-    """Return the Warp struct of a grid: ``frequency`` is 1 / edge length of a cell [1 / m], ``starts`` (members cells +
-    1,) the first sorted particle of each cell, scene after scene."""
+    """Return the Warp struct of a grid. ``frequency`` is the inverse edge length of a cell [1 / m]. ``starts`` is the
+    index of the first sorted particle in each cell (members cells + 1,)."""
     vectors, starts = dict.fromkeys(("origin", "frequency"), precision.vector), wp.array(dtype=wp.int32)
     return struct_of("CellGrid", precision, **vectors, shape=wp.vec3i, starts=starts)
 
 
 @cache
 def cell_functions(precision: Precision) -> SimpleNamespace:
-    """Build the Warp functions ``wrap`` and ``cell_of``. Also build ``below`` and ``above``, the range of relative
-    cells to visit along an axis of n cells, none of them twice."""
+    """Build the Warp functions ``wrap`` and ``cell_of``. Also build ``below`` and ``above``, which return the range of
+    neighbouring cells along an axis."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 
@@ -63,8 +63,8 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def cell_kernels(precision: Precision) -> SimpleNamespace:
-    """Build the kernels ``count``, ``place`` and ``rank`` of a counting sort. Atomic additions run in an order that
-    differs between runs, so ``rank`` restores the given order within each cell."""
+    """Build the kernels ``count``, ``place`` and ``rank`` of a counting sort. ``rank`` restores the given order within
+    each cell, because the order of atomic additions is random."""
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
@@ -80,7 +80,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def count(grid, particles: int, x, counts, arrivals):
-        """Write to ``arrivals`` each particle's cell and its number of earlier arrivals; ``counts`` starts at 0."""
+        """Count the particles in each cell. ``counts`` must be 0 before the launch."""
         i = wp.tid()
         member = i // particles
         cells = grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -94,7 +94,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def place(arrivals, starts, counts, placed, before):
-        """Write each place's particle, and to ``before`` its number of earlier arrivals; reset ``counts``."""
+        """Place each particle at its cell, and reset ``counts`` to 0."""
         i = wp.tid()
         arrival = arrivals[i]
         p = starts[arrival[0]] + arrival[1]
@@ -120,9 +120,8 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
 
 
 class CellSort:
-    """A sort of particles by scene and cell on one device, without reads by the host. Particles too far away to be
-    neighbours are spread over all cells, because work on a GPU grows with the square of the particles in a cell. A CPU
-    counts particles in the given order, so it needs no ranking."""
+    """A sort of particles by scene and cell on one device. Lost particles are spread over all cells, because a GPU is
+    slow with many particles in one cell."""
 
     def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
         self._particles, self._all, self._device = particles, members * particles, device
@@ -132,7 +131,7 @@ class CellSort:
         self._arrivals = wp.empty(self._all, dtype=wp.vec2i, device=device)
         self._before = wp.full(self._all + 1, -1, dtype=wp.int32, device=device)
         self.order = wp.empty(self._all, dtype=wp.int32, device=device)
-        """(n,): index, before sorting, of each sorted particle."""
+        """Original index of each sorted particle (members * n,)."""
         self._placed = self.order if device.is_cpu else wp.empty_like(self.order)
         self.grid = cell_grid_type(precision)()
         self.grid.origin = precision.vector(*grid.origin)
@@ -141,7 +140,7 @@ class CellSort:
         self.grid.starts = wp.zeros(cells + 1, dtype=wp.int32, device=device)
 
     def __call__(self, positions: wp.array) -> None:
-        """Sort positions (members n,) [m] by cell into `order`; ties keep the given order."""
+        """Sort positions (members * n,) [m] by cell into `order`. The sort is stable."""
         if self._all == 0:
             return
         seen = (positions, self.order, self.grid.starts)

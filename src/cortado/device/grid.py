@@ -1,4 +1,4 @@
-"""A grid of cells, without Warp because the reference engine uses the grid too."""
+"""A grid of cells, without Warp, because the reference engine uses it too."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of cells over a region; a cell is at least as wide as the search radius."""
+    """A grid of cells over a region. A cell is at least as wide as the search radius."""
 
     origin: np.ndarray
     """Lower corner of cell 0 [m], (3,)."""
     cell: np.ndarray
     """Edge lengths of a cell [m], (3,)."""
     shape: tuple[int, int, int]
-    """Number of cells along each axis; 1 along z in 2-D."""
+    """Number of cells along each axis. In 2-D it is 1 along z."""
 
     @property
     def cells(self) -> int:
@@ -22,8 +22,8 @@ class Grid:
 
     @classmethod
     def around(cls, lower: np.ndarray, upper: np.ndarray, period: np.ndarray, reach: float, most: int) -> "Grid":
-        """Make a grid over the region from ``lower`` to ``upper`` (d,) [m] for a search radius ``reach`` [m]. With more
-        than about ``most`` cells the grid wraps around."""
+        """Make a grid over the region from ``lower`` to ``upper`` (d,) [m] for a search radius ``reach`` [m]. A grid
+        that would have more than about ``most`` cells wraps around."""
         origin, cell, shape = np.zeros(3), np.full(3, reach), [1, 1, 1]
         for axis in range(len(lower)):
             if period[axis] > 0:

@@ -1,7 +1,7 @@
-"""Launches of kernels with arguments by name, on a whole device or in ranges of particles on the cores of a CPU.
+"""Launch kernels with arguments by name, on a whole device or in ranges of particles on the cores of a CPU.
 
-A bundle is a Warp struct of arrays that a kernel takes as one argument. A launch fills the bundle with the arrays of
-its fields' names. In a bundle called ``dot`` or ``bar``, the field x stands for the array ``x_dot`` or ``x_bar``.
+A bundle is a Warp struct of arrays, which is one argument of a kernel. Each field of a bundle is the array of the same
+name. In a bundle called ``dot`` or ``bar``, the field ``x`` is the array ``x_dot`` or ``x_bar``.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ _FIELDS: dict[Any, tuple[str, ...]] = {}
 
 @cache
 def bundle(**entries: Any) -> Any:
-    """Return the Warp struct of arrays with these names and entry types."""
+    """Return the Warp struct of arrays with the given names and element types."""
     words = (f"{name}_{wp.types.type_size_in_bytes(kind)}" for name, kind in entries.items())
     arrays = {name: wp.array(dtype=kind) for name, kind in entries.items()}
     made = wp.struct(type("_".join(("Bundle", *words)), (), {"__annotations__": arrays, "__module__": __name__}))
@@ -40,16 +40,15 @@ def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
 
 
 Named = Mapping[str, Any]
-"""Arguments of kernels by name."""
 
 
 def bound(
     kernel: wp.Kernel, groups: Sequence[Named], given: Named, filled: dict[tuple[Any, ...], Any] | None = None
 ) -> list[Any]:
-    """Return a kernel's arguments in its order, from ``given`` or from the first of the ``groups`` that contains each.
-    Filled bundles are cached in ``filled``, because filling a bundle takes longer than a launch.
+    """Return the arguments of a kernel in the order of its signature. Each argument comes from ``given``, or else from
+    the first of the ``groups`` with the name. Bundles are cached in ``filled``.
 
-    Raise `TypeError` for a missing argument, or if the kernel lacks one of the ``given`` arguments.
+    Raises `TypeError` if an argument is missing, or if the kernel has no argument with a name in ``given``.
     """
     names, arguments = _signature(kernel)
     for name in given:
@@ -90,7 +89,8 @@ def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
 
 @cache
 def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], list[tuple[str, Any, list[str]]]]:
-    """Return the argument names, with arrays in place of bundles, and (name, bundle, arrays) of each argument."""
+    """Return the names of the arguments, with the arrays of bundles instead of bundles. Also return the name, bundle
+    and arrays of each argument."""
     arguments = []
     for a in kernel.adj.args:
         struct = a.type if a.type.__hash__ and a.type in _FIELDS else None
@@ -102,17 +102,18 @@ def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], list[tuple[str, Any,
 MOST_PARTS = 32
 LEAST_PART = 2000
 PARTS_A_CORE = 4
-"""Greatest number of ranges per core, so that an idle core can take over the ranges of a busy core."""
+"""Greatest number of ranges per core."""
 LEAST_SHARED_PART = 10_000
 
 Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
-"""A function of a launch's name, threads and arguments, and of the launching function, which it must call."""
+"""A function that is called instead of a launch. It gets the kernel's name, the number of threads, the arguments, and a
+function that launches the kernel."""
 _watchers: list[Watcher] = []
 
 
 @contextmanager
 def watched(watcher: Watcher) -> Iterator[None]:
-    """Pass every launch of this process in the block to a watcher, except those of a replayed graph."""
+    """Pass every launch of this process to ``watcher``, except launches in a replayed graph."""
     _watchers.append(watcher)
     try:
         yield
@@ -135,8 +136,8 @@ def starts_at_first(kernel: wp.Kernel) -> bool:
 def launch(
     kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, block: int | None = None, **arguments: Any
 ) -> None:
-    """Launch a kernel, off any tape; ``threads`` is a number or a shape, ``block`` the GPU threads that share
-    memory."""
+    """Launch a kernel outside Warp's tape. ``threads`` is a number or a shape. ``block`` is the number of GPU threads
+    that share memory."""
     announce(kernel, device)
     inputs, sizes = bound(kernel, groups, arguments), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
@@ -152,7 +153,7 @@ def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> 
 
 
 def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
-    """Run work that launches several kernels and is repeatable only as a whole; watchers see a single launch."""
+    """Run several launches that can only be repeated as a whole. Watchers get a single launch."""
 
     def unwatched() -> None:
         watchers = _watchers.copy()
@@ -166,20 +167,21 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 
 class KernelLauncher:
-    """A launcher of kernels with a thread for each particle on one device; `bound` finds the arguments.
+    """A launcher of kernels on one device, with one thread for each particle.
 
-    On a CPU a kernel with the neighbourhood ``s`` is launched in ranges of particles, which the cores share. The kernel
-    works on particle ``s.first + wp.tid()``. Sums are gathers, so the bits do not depend on ranges or cores.
+    On a CPU, the cores share the launch of a kernel with the neighbourhood argument ``s``. Each launch covers a range
+    of particles, and the kernel computes particle ``s.first + wp.tid()``. The results do not depend on the number of
+    cores.
     """
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
-        """Prepare launches; with ``record_tape`` an open tape of Warp records them."""
+        """Prepare launches. If ``record_tape`` is true, an open Warp tape records the launches."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
         self._cores = min(usable_cores(), MOST_CORES) if device.is_cpu and not record_tape else 1
         each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
         most = self._cores * max(each, 1) if self._cores > 1 else 1
         self.parts = max(min(most, particles // LEAST_PART), 1)
-        """Number of ranges of particles in a launch of a sum over neighbours."""
+        """Number of ranges of particles in a launch."""
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
         self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
         self._side_is_busy = False
@@ -218,13 +220,13 @@ class KernelLauncher:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Launch the block in a second GPU stream, concurrently with later launches until `join`."""
+        """Launch kernels in a second GPU stream, concurrently with later launches until `join`."""
         self._side_is_busy = self._side is not None
         with wp.ScopedStream(self._side):
             yield
 
     def join(self) -> None:
-        """Make later launches wait for those of `aside`."""
+        """Make later launches wait for the second GPU stream."""
         if self._side_is_busy:  # a stream that a capture has not seen must not be waited for within it
             wp.wait_stream(self._side)
             self._side_is_busy = False
@@ -248,8 +250,8 @@ class KernelLauncher:
 
 
 class CapturedGraph:
-    """Work with fixed arrays, replayed as a captured graph. The first call runs without a graph unless the work
-    ``is_warm``: capture forbids it to load modules and allocate memory."""
+    """Launches with fixed arrays that are replayed as a captured graph. Unless ``is_warm`` is true, the first call runs
+    without a graph, because capture forbids loading modules and allocating memory."""
 
     def __init__(self, work: Callable[[], None], launch: KernelLauncher, is_warm: bool = False):
         self._work, self._launch = work, launch
@@ -270,11 +272,12 @@ class CapturedGraph:
 
 BANDS = 8
 LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
-"""Least number of threads in a band, and in one of many short launches that is cut into bands."""
+"""Least number of threads in a range, and in a frequent launch that is divided into ranges."""
 
 
 class BandLauncher:
-    """A launcher of any number of threads, on a CPU in bands; kernels work on thread ``first + wp.tid()``."""
+    """A launcher for any number of threads, which are divided into ranges on a CPU. Kernels compute the value with
+    index ``first + wp.tid()``."""
 
     def __init__(self, device: Any):
         self.device, self._compiled = device, set[Any]()
@@ -297,8 +300,8 @@ class BandLauncher:
     def to_and_fro(
         self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
     ) -> wp.array:
-        """Launch a kernel ``rounds`` times, with a thread for each value; the kernel computes ``found`` from
-        ``values``. Successive launches swap the two arrays; return the array of the last launch."""
+        """Launch a kernel ``rounds`` times, and swap its input and output array after each launch. Returns the last
+        output."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
             ways: list[Callable[[], None]] = [partial(self, kernel, count, **arguments, **one) for one in both]
@@ -315,7 +318,7 @@ class HostCopy:
         self._copy: Any = array if array.device.is_cpu else None
 
     def read(self, rows: int | None = None) -> np.ndarray:
-        """Return the array, or its first ``rows``, once the device is done; the next call overwrites the result."""
+        """Wait for the device, and return the array or its first ``rows`` rows. The next call overwrites the result."""
         if rows == 0:
             return wp.empty((0, *self._array.shape[1:]), dtype=self._array.dtype, device="cpu").numpy()
         if self._copy is None:

@@ -1,11 +1,10 @@
-"""The start of Warp without messages, and the parallel compilation of Warp modules before their first launch.
-
-On a CPU, LLVM vectorises the loops over `UNROLL` neighbours only with a greater search depth than Warp's default of 4:
-with 4 a step of the projection takes a fifth longer, and with LLVM's own 12 the density does. `wp.force_load` with its
-own workers is not used: after Ctrl-C it waits for all modules, and for a few modules it takes 1.7 times as long.
+"""Start Warp without messages, and compile Warp modules in parallel before their first launch.
 
 The environment variable CORTADO_VERBOSE=1 shows Warp's messages. A ``warp.config.log_level`` that the user has changed
 is respected.
+
+On a CPU, LLVM needs a greater search depth than Warp's default to vectorise the loops over `UNROLL` neighbours.
+`wp.force_load` with its own workers is not used, because it is slow and cannot be interrupted by Ctrl-C.
 """
 
 import atexit
@@ -34,7 +33,7 @@ from cortado.errors import ComputationError, InputError, shown
 from cortado.files.terminal import note, say, timed_note
 
 SHALLOW, DEEP = "-slp-recursion-max-depth=4", "-slp-recursion-max-depth=7"
-"""LLVM option for the search depth of vectorisation: Warp's default, and the value for Cortado's modules."""
+"""LLVM options for the search depth of vectorisation: Warp's default and Cortado's value."""
 UNUSED = "-DWP_NO_BFLOAT16="
 
 
@@ -52,21 +51,20 @@ class Kernels:
 
     forward: Any
     tangent: Any
-    """Kernel of forward mode: computes output tangents from input tangents ``x_dot``."""
+    """Kernel of forward mode, which computes the tangents ``x_dot`` of its outputs."""
     adjoint: Any
-    """Kernel of reverse mode: adds to input adjoints ``x_bar``, given output adjoints."""
+    """Kernel of reverse mode, which adds to the adjoints ``x_bar`` of its inputs."""
 
 
 def by_name(*made: Any) -> SimpleNamespace:
-    """Return Warp functions or kernels as attributes, by the names of their Python functions."""
+    """Return Warp functions or kernels as attributes with the names of their Python functions."""
     return SimpleNamespace(**{one.func.__name__.rpartition("__")[2]: one for one in made})
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """Return the part of a Warp module's name for its kind of kernels: "forward", "taped" or "derivative".
+    """Return a kind of kernels, as part of a Warp module's name: "forward", "taped" or "derivative".
 
-    Kernels that a tape differentiates have separate modules, because Warp's adjoint of a kernel takes three times as
-    long to compile as the kernel.
+    Kernels for Warp's tape have separate modules, because the adjoints of the kernels take long to compile.
     """
     if not forward:
         return "derivative"
@@ -90,8 +88,8 @@ class _Said:
 
 
 def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
-    """Compile the modules of the kernels of an object and its parts once per object, without tangents, and without
-    ``adjoints`` unless they are wanted."""
+    """Compile all kernels of an object and its parts, once per object. Kernels of tangents are left out. Kernels of
+    adjoints are compiled only if ``adjoints`` is true."""
     if _ahead.get(id(owner)) is not owner:
         _ahead[id(owner)] = owner
         left_out = ("_tangent_",) if adjoints else DERIVATIVES
@@ -99,7 +97,7 @@ def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
 
 
 def compile_meanwhile(owner: Any, device: Any) -> None:
-    """Start to compile an object's kernels in another thread of a CPU; `compile_ahead` waits for the result."""
+    """Start to compile an object's kernels in another thread. `compile_ahead` waits for the result."""
     if not device.is_cpu or usable_cores() < 2:
         return
     sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
@@ -110,7 +108,7 @@ def compile_meanwhile(owner: Any, device: Any) -> None:
 
 
 def announce(kernel: wp.Kernel, device: Any) -> None:
-    """Print a line on stderr, once per process, if a kernel about to be launched must be compiled."""
+    """Print a line on stderr before a kernel is compiled, once per process."""
     module = kernel.module
     if module not in _looked_at:
         _looked_at.add(module)
@@ -142,7 +140,8 @@ def kernels_of(owner: Any) -> list[wp.Kernel]:
 
 
 def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
-    """Compile and load the missing modules of the kernels; a single one is left to its launch."""
+    """Compile and load the missing modules of the kernels in parallel. A single missing module is compiled at its
+    launch."""
     sizes = _sizes(kernels)
     wait([_begun.pop(module) for module in sizes if module in _begun])
     missing = _missing(sizes, device)
@@ -189,7 +188,8 @@ VERBOSE = "CORTADO_VERBOSE"
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Suppress Warp's messages in the block, and afterwards all but warnings, except if the user chose a log level."""
+    """Suppress Warp's messages, unless the user chose a log level. After the block only warnings and errors
+    are shown."""
     chosen = wp.config.log_level
     if os.environ.get(VERBOSE, "0") not in ("", "0") or chosen < wp.LOG_INFO:
         yield
@@ -204,7 +204,7 @@ def silenced() -> Iterator[None]:
 
 @contextmanager
 def c_stderr_to(file: int) -> Iterator[None]:
-    """Redirect stderr of C code in the block to an open file."""
+    """Redirect the stderr of C code to an open file."""
     try:
         stderr = os.dup(2)
     except OSError:  # there is none
@@ -225,8 +225,8 @@ ROOM = 16 * 2**20
 
 @cache
 def start_warp() -> None:
-    """Start Warp once per process, without its greeting. If Warp's cache is unusable, warn and compile missing kernels
-    in a temporary folder. Raise `ComputationError` if no temporary folder can be made."""
+    """Start Warp once per process. If Warp's cache is unusable, print a warning and compile kernels in a temporary
+    folder. Raises `ComputationError` if no temporary folder can be made."""
     reason = _start()
     folder = wp.config.kernel_cache_dir
     reason = reason or _trouble(folder)
@@ -249,7 +249,7 @@ def start_warp() -> None:
 
 
 def complaint(error: Exception) -> str | None:
-    """Return a sentence for an error from loading or compiling a kernel; None for any other error."""
+    """Return a sentence for an error in loading or compiling a kernel, or None for any other error."""
     frames = traceback.extract_tb(error.__traceback__)
     loading = any(frame.name == "load" and Path(frame.filename).parts[-3:-1] == ("warp", "_src") for frame in frames)
     missing = isinstance(error, RuntimeError) and str(error).startswith("Failed to find ")
@@ -272,7 +272,7 @@ def _start() -> str | None:
 
 
 def _trouble(folder: str) -> str | None:
-    """Return why a folder cannot store kernels, or None if it can."""
+    """Return the reason why a folder cannot store kernels, or None if it can."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free
@@ -289,7 +289,7 @@ def _kernels(folder: str) -> Iterator[Path]:
 
 
 def _is_whole(kernel: Path) -> bool:
-    """Test on Linux if a kernel's object files end with their section table, so that the loader prints no errors."""
+    """Test on Linux whether a kernel's object files are complete."""
     if sys.platform != "linux":
         return True
     for file in kernel.glob("*.o"):
@@ -307,7 +307,8 @@ def _is_whole(kernel: Path) -> bool:
 
 
 def _replacement(folder: str) -> str:
-    """Return a temporary folder for kernels, deleted at exit, with links to the intact kernels of the cache."""
+    """Return a temporary folder for kernels with links to the intact kernels in Warp's cache. The folder is deleted at
+    exit."""
     temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     with suppress(OSError):
@@ -341,7 +342,6 @@ def installed_driver() -> Version | None:
 
 
 def _needed() -> Version | None:
-    """Return the CUDA version that Warp needs; None if unknown."""
     with suppress(ImportError, AttributeError):  # Warp keeps it for itself, and may move it
         from warp._src.context import runtime
 
@@ -354,7 +354,7 @@ def _shown(version: Version) -> str:
 
 
 def device_named(name: str) -> Any:
-    """Return Warp's device with this name; raise `InputError` if it does not exist."""
+    """Return the Warp device with this name, or raise `InputError`."""
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     if not isinstance(name, str):

@@ -1,10 +1,10 @@
-"""The two floating-point precisions, with Warp functions for roots, reciprocals and lanes; and types of parameters by
-name.
+"""The two floating-point precisions, with Warp functions for them, and types of parameters by name.
 
-Lanes are GPU threads that share a particle: they process different neighbours, and a butterfly of shuffles adds their
-sums with the same bits in every lane. The first lane writes the result. Lanes occupy a large GPU when particles are
-few. A kernel for lanes is launched with LANES threads per particle and computes its particle as `wp.tid() // LANES`. A
-CPU and Warp's tape have a single lane.
+Lanes are GPU threads that share a particle. Each lane processes different neighbours, and the sums over the lanes are
+the same bits in every lane. The first lane writes the result. Lanes speed up simulations with few particles.
+
+A kernel for lanes is launched with LANES threads per particle and computes its particle as `wp.tid() // LANES`. On a
+CPU and for Warp's tape there is a single lane.
 """
 
 import inspect
@@ -27,15 +27,15 @@ class Precision:
     name: str
     real: Any
     vector: Any
-    """Warp vector type of three components; z is 0 in 2-D."""
+    """Warp vector type of three components. In 2-D, z is 0."""
     pair: Any
     numpy: type
     tiny: float
-    """Positive number far below round-off of 1, with a finite reciprocal."""
+    """Very small positive number with a finite reciprocal."""
     furthest: float
-    """Distance from the origin [spacings] up to which positions are rounded to at most about 0.001 spacings."""
+    """Greatest distance of positions from the origin [spacings]. Rounding is then at most about 0.001 spacings."""
     greatest: float
-    """Greatest size of a parameter, so that products of several parameters stay finite."""
+    """Greatest size of a parameter. It keeps products of several parameters finite."""
 
     @property
     def bytes(self) -> int:
@@ -43,20 +43,19 @@ class Precision:
 
     @property
     def six(self) -> Any:
-        """Warp vector type of six components, for symmetric matrices."""
+        """Warp vector type of six components for symmetric matrices."""
         return wp.types.vector(length=6, dtype=self.real)
 
     @property
     def matrix(self) -> Any:
-        """Warp type of 3 x 3 matrices."""
         return wp.types.matrix(shape=(3, 3), dtype=self.real)
 
     def vector_of(self, values: Iterable[float]) -> Any:
-        """Return a Warp vector of two or three components; in 2-D z is 0."""
+        """Return a Warp vector of three components, from two or three numbers. In 2-D, z is 0."""
         return self.vector(*(*values, 0.0)[:3])
 
     def fractions(self, phases: int) -> Any:
-        """Return the Warp vector type with a number for each phase."""
+        """Return the Warp vector type with one component for each phase."""
         return wp.types.vector(length=phases, dtype=self.real)
 
 
@@ -65,7 +64,7 @@ FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-20
 
 
 def precision_named(name: str) -> Precision:
-    """Return the precision called ``"float32"`` or ``"float64"``; raise `InputError` for any other name."""
+    """Return the precision called ``"float32"`` or ``"float64"``, or raise `InputError`."""
     for precision in (FLOAT32, FLOAT64):
         if isinstance(name, str) and precision.name == name:
             return precision
@@ -73,7 +72,7 @@ def precision_named(name: str) -> Precision:
 
 
 def struct_of(name: str, precision: Precision, **fields: Any) -> Any:
-    """Return the Warp struct of a name and a precision with fields of these types."""
+    """Return the Warp struct with a name, a precision and fields of the given types."""
     return wp.struct(type(f"{name}_{precision.name}", (), {"__annotations__": fields, "__module__": __name__}))
 
 
@@ -85,12 +84,12 @@ class TypesByName:
         @fluid_sum(discretisation, typed)
         def spread(x_ij, x_dot_ij, v_ij, m_i, m_j, s) -> vector: ...
 
-    A parameter without annotation gets the type of the longest listed name that begins its name, as x begins x_dot_ij.
-    Without such a name the parameter gets the usual type.
+    A parameter without annotation gets its type from the listed names. The longest listed name at the beginning of the
+    parameter's name counts, such as x for x_dot_ij. Without a listed name the parameter gets the usual type.
     """
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
-        """Set the usual type, and tables from types to names; later tables have priority."""
+        """Set the usual type, and tables that map types to names. Later tables have priority."""
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
@@ -98,11 +97,11 @@ class TypesByName:
         return self._give(function, lambda kind: kind)
 
     def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Add array types or Warp structs to a kernel's parameters; arrays that the kernel writes must come last."""
+        """Add array types or Warp structs to the parameters of a kernel. Output arrays must come last."""
         return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
 
     def kernel(self, module: Any, **options: Any) -> Callable[..., Any]:
-        """Return the decorator of a kernel in a Warp module, whose parameters get types as by `arrays`."""
+        """Return a decorator for kernels in a Warp module, which gives types to the parameters like `arrays`."""
         return lambda function: wp.kernel(self.arrays(function), module=module, **options)
 
     def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
@@ -120,8 +119,8 @@ class TypesByName:
 
 @cache
 def arithmetic(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Build the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of positive normal numbers. Only ``taped``
-    ones have derivatives; they round as IEEE 754 demands."""
+    """Build the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of positive normal numbers. If ``taped``
+    is true, the functions have derivatives and exact IEEE 754 rounding."""
     return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
 
 
@@ -163,7 +162,7 @@ def _of_the_gpu() -> SimpleNamespace:
 
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
-"""Pairs (greatest number of particles, lanes) on a GPU; above the last, one lane."""
+"""Pairs of the greatest number of particles and the number of lanes on a GPU."""
 _OF_MODULES: dict[str, int] = {}
 
 
@@ -178,7 +177,7 @@ def lanes_of(kernel: wp.Kernel) -> int:
 
 @cache
 def check_lanes(kernel: wp.Kernel) -> None:
-    """Raise `TypeError` for a kernel that calls a sum over lanes without a thread for each lane."""
+    """Raise `TypeError` for a kernel that sums over lanes but has only one thread per particle."""
     source = kernel.adj.source
     if "wp.tid() // LANES" in source and "lane()" in source:
         return
@@ -202,7 +201,7 @@ COUNTS = (1, 2, 4, 8, 16)
 
 
 def checked_lanes(lanes: Any) -> int | None:
-    """Return the user's argument ``lanes``, or None; raise `InputError` for an invalid number."""
+    """Return the user's number of lanes or None. Raises `InputError` for an invalid number."""
     if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
         wanted = ", ".join(map(str, COUNTS))
         raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")
@@ -210,7 +209,8 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """Return the number of lanes on a device; on a GPU ``wanted``, by default one that suits the particles."""
+    """Return the number of lanes on a device. On a GPU this is ``wanted``, or by default a number that depends on the
+    number of particles."""
     if device.is_cpu:
         return 1
     return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
@@ -218,10 +218,11 @@ def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
 
 @cache
 def lane_functions(precision: Precision, lanes: int) -> SimpleNamespace:
-    """Build the Warp functions for kernels with a number of lanes, a power of 2 up to 32.
+    """Build the Warp functions for kernels with ``lanes`` lanes, which is a power of 2 up to 32.
 
-    ``lane`` returns the index of a thread's lane; ``add_up`` and ``add_up_vectors`` return sums over the lanes. Bit k
-    of ``vote`` is set if lane k votes yes; ``ones`` counts the set bits, ``before`` those of lower lanes.
+    ``lane`` returns the index of a thread's lane. ``add_up`` and ``add_up_vectors`` return sums over the lanes.
+    ``vote`` returns an integer whose bit k is set if lane k votes yes. ``ones`` counts the set bits, and ``before``
+    counts the set bits of lower lanes.
     """
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 

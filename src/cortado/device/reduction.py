@@ -1,7 +1,7 @@
 """Sums over particles in a fixed order, so that repeated runs give the same bits.
 
-A reduction turns the ``count`` values of each scene into ``stride`` partial values. A partial value is computed by a
-thread on a CPU, and by a block of threads on a GPU.
+A reduction first turns the values of each scene into a few partial values. Each partial value is computed by one thread
+on a CPU and by one block of threads on a GPU.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ BRANCHES = 32
 BLOCK = 1024
 EACH = 8
 SHARED = 32 * 1024
-"""Greatest shared memory of a block [bytes]."""
+"""Greatest shared memory of a block of GPU threads [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKerne
 
 
 def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
-    """Return a kernel that combines the values t, t + T, t + 2 T, ... of a scene into partial[t]."""
+    """Return a kernel that combines a scene's values into partial values, with one thread for each partial value."""
 
     def reduce(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
         t = wp.tid() % stride
@@ -71,7 +71,8 @@ def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
 
 
 def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
-    """Return the kernel of `_of_threads` with blocks of threads; ``combine`` is a C++ expression in a and b."""
+    """Return a kernel that combines a scene's values into partial values, with one block of threads for each partial
+    value. ``combine`` is a C++ expression in a and b."""
     threads = BLOCK
     while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
         threads //= 2
@@ -124,7 +125,7 @@ def add_kernel(dtype: Any) -> Any:
 
 
 class TreeReduction:
-    """A reduction of (members n,) values to one value per scene, in a fixed order."""
+    """A reduction of values (members * n,) to one value per scene, in a fixed order."""
 
     def __init__(self, level: ReductionKernel, dtype: Any, particles: int, device: Any, members: int = 1):
         self._level, self._device, self._particles = level, device, particles
@@ -135,7 +136,7 @@ class TreeReduction:
             self._partials.append((size, wp.zeros(members * size, dtype=dtype, device=device)))
 
     def __call__(self, values: wp.array) -> wp.array:
-        """Return the sums (members,), which the next call overwrites."""
+        """Return the reduced values (members,). The next call overwrites the result."""
         count, level, device = self._particles, self._level, self._device
         for size, sums in self._partials:
             arguments = {"count": count, "stride": size, "values": values, "partial": sums}
@@ -145,12 +146,13 @@ class TreeReduction:
 
 
 def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeReduction:
-    """Return a reduction that sums (members n,) numbers, vectors or matrices of a Warp type."""
+    """Return a reduction that adds up numbers, vectors or matrices (members * n,)."""
     return TreeReduction(sum_kernel(dtype, device.is_cpu), dtype, particles, device, members)
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
-    """Return a reduction of pairs (members n,) to the sum of first and the maximum of second components."""
+    """Return a reduction of pairs (members * n,). It computes the sum of the first components and the maximum of the
+    second components."""
     level = sum_and_maximum_kernel(precision, device.is_cpu)
     return TreeReduction(level, precision.pair, particles, device, members)
 

@@ -1,10 +1,9 @@
-"""Cores, threads and processes: the number of usable cores, locks on Warp and on simulations, calls in worker
-processes; and estimates of memory.
+"""Usable cores, locks on Warp and on simulations, calls in worker processes, and estimates of memory.
 
-Only one thread at a time may use Warp, because Warp has one state per process, such as the graph being captured.
+Only one thread at a time may use Warp, because Warp has one state per process.
 
-Memory is estimated before it is allocated, to within a factor of about 1.5, so that a lack of memory is reported as a
-sentence. Estimates leave out checkpoints, because a rollout adapts their number to the free memory.
+Memory is estimated before it is allocated, so that a lack of memory gives a clear error. An estimate may be wrong by a
+factor of about 1.5. Checkpoints are left out, because a rollout adapts their number to the free memory.
 """
 
 import os
@@ -34,8 +33,8 @@ CORES = "CORTADO_CORES"
 
 
 def usable_cores() -> int:
-    """Return the number of cores that this process may use, at most the environment variable CORTADO_CORES. Raise
-    `InputError` if this variable is not a number of cores."""
+    """Return the number of cores that this process may use. The environment variable CORTADO_CORES can reduce the
+    number. Raises `InputError` if the variable is invalid."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get(CORES, "").strip()
     if not limit:
@@ -54,8 +53,8 @@ def helpers() -> ThreadPoolExecutor:
 
 
 def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
-    """Call ``work`` for each item on several cores, and return when all calls have ended. After an error, which is
-    raised, or an interruption, no further item is started."""
+    """Call ``work`` for each item on several cores and wait for all calls. After an error or an interruption the
+    remaining items are skipped."""
     waiting = iter(items)
 
     def take() -> None:
@@ -75,7 +74,7 @@ def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int)
 
 
 class WarpLock(ContextDecorator, threading.local):
-    """The lock that a thread holds while it uses Warp; a reentrant context or decorator."""
+    """The lock that a thread holds while it uses Warp. It can be used as a context or a decorator, and is reentrant."""
 
     _lock = threading.RLock()
     _entries = 0
@@ -92,7 +91,7 @@ class WarpLock(ContextDecorator, threading.local):
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Release the lock in the block, around work that does not use Warp's state or waits for another thread."""
+        """Release the lock in the block. Code in the block must not use Warp."""
         entries = self._entries
         if entries:
             self._let_go()
@@ -114,10 +113,10 @@ WARP = WarpLock()
 
 
 class Turn:
-    """The lock that a thread holds while it uses a simulation. Threads with other simulations may use Warp while a
-    captured graph is replayed.
+    """The lock that a thread holds while it uses a simulation. While a captured graph is replayed, other threads may
+    use Warp.
 
-    ``with simulation.turn:`` makes several calls one uninterrupted unit.
+    Several calls inside ``with simulation.turn:`` are not interrupted by other threads.
     """
 
     def __init__(self, device: Any):
@@ -166,7 +165,7 @@ Self = TypeVar("Self", bound=_HasTurn)
 
 
 def in_turn(method: Callable[Concatenate[Self, P], R]) -> Callable[Concatenate[Self, P], R]:
-    """Make a method hold its object's lock ``turn`` while it runs."""
+    """Decorate a method so that it holds the lock ``turn`` of its object while it runs."""
 
     @wraps(method)
     def held(self: Self, *args: P.args, **options: P.kwargs) -> R:
@@ -198,11 +197,11 @@ class Payload:
     digest: str
     versions: str
     content: bytes | None
-    """The pickled function; None if the worker should have cached the function."""
+    """Pickled function, or None if the worker should have the function in its cache."""
 
     @classmethod
     def of(cls, function: Callable[[Any], Any]) -> "Payload":
-        """Pickle a function into a payload; raise `InputError` if that is impossible."""
+        """Pickle a function, or raise `InputError`."""
         content = pickled(function, "The function")
         return cls(sha256(content).hexdigest(), versions(), content)
 
@@ -213,7 +212,7 @@ class Payload:
 
 @dataclass(frozen=True)
 class Lacking:
-    """A worker's answer if it has not cached the function of a payload without content."""
+    """The answer of a worker that does not have the function in its cache."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +223,7 @@ class Answer:
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
 
     def result(self) -> Any:
-        """Return the function's result, after repeating its warnings; raise its error."""
+        """Issue the warnings of the call, and return its result or raise its error."""
         for text, category in self.warnings:
             warn(text, category)
         if self.error is None:
@@ -235,7 +234,8 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """Pickle a value with code of the main module; raise `InputError`, which begins with ``what``, if that fails."""
+    """Pickle a value, including code of the main module. Raises `InputError` with a message that begins with
+    ``what``."""
     import cloudpickle
 
     try:
@@ -250,8 +250,8 @@ def versions() -> str:
 
 
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
-    """Call the payload's function for an item in a worker process, one call at a time. The answer contains any
-    exception, even one that would end the process."""
+    """Call the payload's function for an item in a worker process. The answer contains any exception of the
+    function."""
     with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
         if payload.content is None and payload.digest not in _functions:
             return Lacking()
@@ -311,16 +311,15 @@ def in_words(error: BaseException) -> str:
 
 
 _PARTICLE, _WALL, _STEP, _FRAME, _PIXEL = 56.0, 110.0, 50.0, 150.0, 110.0
-"""[bytes]"""
+"""Memory per particle, wall particle, step, frame and pixel [bytes]."""
 _WEIGHING = 1600.0
-"""Bytes per wall particle while its weight is computed."""
+"""Memory per wall particle during the computation of weights [bytes]."""
 _REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
 _REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
-"""[numbers]"""
+"""Stored numbers per particle, in the backward pass and in an iteration."""
 _CGROUP = Path("/sys/fs/cgroup")
 _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"))
-"""Files of a control group, of version 2 or 1, for the memory limit and use [bytes]. The functions below return memory
-[bytes] by purpose; ``real`` is the size of a number [bytes]."""
+"""Files with the memory limit and the used memory of a Linux control group [bytes], for versions 2 and 1."""
 
 
 def sampling_parts(particles: float, walls: float) -> dict[str, float]:
@@ -361,14 +360,15 @@ def sample_parts(samples: int, pixels: int, real: int) -> dict[str, float]:
 
 
 def require(parts: Mapping[str, float], advice: str, device: Any = None) -> None:
-    """Raise `InputError` if memory [bytes] by purpose exceeds the free memory of a Warp ``device``."""
+    """Raise `InputError` if the required memory exceeds the free memory of ``device``. ``parts`` is the required memory
+    by purpose [bytes]."""
     lack = shortage(parts, device)
     if lack:
         raise InputError(f"This needs {lack}; {advice}.")
 
 
 def shortage(parts: Mapping[str, float], device: Any = None) -> str:
-    """Return the needed and the free memory in words; empty if the free memory suffices."""
+    """Return a sentence on the required and the free memory, or an empty text if the free memory suffices."""
     needed, free = sum(parts.values()), available(device)
     if needed <= free:
         return ""
@@ -382,14 +382,14 @@ def within(budget: float, device: Any = None) -> int:
 
 
 def available(device: Any = None) -> float:
-    """Return the free memory [bytes] of a Warp device, or of this process on a CPU; infinite if unknown."""
+    """Return the free memory of a Warp device or of this process [bytes]. It is infinite if it is unknown."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
     return max(min(float(psutil.virtual_memory().available), _of_container(), _of_process()), 0.0)
 
 
 def _of_container() -> float:
-    """Return the control group's memory limit minus its use [bytes], with cached files as free; or infinity."""
+    """Return the free memory of the Linux control group [bytes], or infinity. Cached files count as free."""
     for limit, used in _LIMITS:
         with suppress(OSError, ValueError):
             stat = (_CGROUP / used).with_name("memory.stat").read_text().split()
@@ -399,7 +399,7 @@ def _of_container() -> float:
 
 
 def _of_process() -> float:
-    """Return the limit of the address space (``ulimit -v``) minus its use [bytes]; infinite without a limit."""
+    """Return the free address space of this process under ``ulimit -v`` [bytes]. Without a limit it is infinite."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 

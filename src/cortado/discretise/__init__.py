@@ -1,1 +1,1 @@
-"""The rest lattice, smoothing kernels, shapes, packing and walls. NumPy, float64."""
+"""The rest lattice, smoothing kernels, shapes, packing and walls, in NumPy and float64."""

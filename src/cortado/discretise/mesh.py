@@ -1,4 +1,4 @@
-"""Solids whose surface is made of triangles, in float64."""
+"""Solids with a surface of triangles, in float64."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,27 +14,24 @@ from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments
 
 LEAF = 8
 BITS = 10
-"""Bits of each coordinate by which points are sorted along a curve."""
 SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """A tree of triangles, split recursively across the longest side of the box around their centres;
-    `cortado.discretise.tree_kernels` numbers the nodes."""
+    """A binary tree of boxes around triangles. `cortado.discretise.tree_kernels` describes the numbering of
+    the nodes."""
 
     corners: Points
-    """(k, 3, 3) leaf after leaf [m]"""
+    """Corners of the triangles (k, 3, 3) [m], sorted by the leaves of the tree."""
     order: Numbers
-    """(k,) original indices"""
     starts: NDArray[np.int32]
-    """(leaves + 1,) first triangle of each leaf, and the number of triangles."""
+    """Index of the first triangle of each leaf (leaves + 1,). The last entry is the number of triangles."""
     boxes: Points
-    """(2 leaves, 6) lower and upper corner of each node's box [m]; row 0 is unused."""
+    """Lower and upper corner of the box of each node (2 leaves, 6) [m]. Entry 0 is unused."""
 
     @classmethod
     def of(cls, corners: Points) -> "TriangleTree":
-        """Build the tree of at least one triangle with corners (k, 3, 3) [m]."""
         count, middles = len(corners), corners.mean(axis=1)
         levels = max(int(np.ceil(np.log2(count / LEAF))), 0)
         order = np.arange(count)
@@ -57,8 +54,8 @@ class TriangleTree:
         return TriangleTree(corners, self.order, self.starts, boxes)
 
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
-        """Return the nearest points (n, 3) of the triangles to points (n, 3) [m], and their distances (n,) [m]; without
-        a triangle within ``reach`` [m], the point and ``reach``."""
+        """Return the nearest points on the triangles (n, 3) [m] and the distances (n,) [m]. If no triangle is within
+        ``reach`` [m], the nearest point is the given point, and the distance is ``reach``."""
         order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)
         nearest, squares = np.empty((len(points), 3)), np.empty(len(points))
         self.ask("find_nearest", points[order], reach=reach, nearest=nearest, squares=squares)
@@ -73,8 +70,8 @@ class TriangleTree:
         return found
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
-        """Return the pairs (m, 2) of triangles that cross: an edge of one passes through the other by more than
-        ``tolerance`` [m] on both sides. Common vertices, with equal ``names`` (k, 3), are no crossings."""
+        """Return the index pairs (m, 2) of triangles that cross each other by more than ``tolerance`` [m]. Triangles do
+        not cross at a common vertex. ``names`` (k, 3) has equal entries at common vertices."""
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -88,8 +85,7 @@ class TriangleTree:
         return np.sort(self.order[pairs], axis=1)
 
     def beside(self, other: "TriangleTree", reach: float) -> Numbers:
-        """Return pairs (m, 2) of triangles of two trees whose boxes are at most ``reach`` [m] apart along every
-        axis."""
+        """Return the index pairs (m, 2) of triangles in two trees that have boxes at most ``reach`` [m] apart."""
         pairs = np.ones((1, 2), dtype=np.int64)
         leaves = np.array([len(self.starts) - 1, len(other.starts) - 1])
         while (pairs < leaves).any():
@@ -127,7 +123,6 @@ class TriangleTree:
 
 
 def _starts(count: int, level: int) -> Numbers:
-    """Return the first triangle of each node of a level, followed by the number of triangles, (2^level + 1,)."""
     return (np.arange(2**level + 1) * count) >> level
 
 
@@ -137,7 +132,7 @@ def _near(first: Points, second: Points, reach: float) -> Which:
 
 
 def _along_a_curve(points: Points) -> Numbers:
-    """Return the order (n,) of points (n, 3) along a space-filling curve (Morton 1966)."""
+    """Return the order (n,) of points along a space-filling curve (Morton 1966)."""
     if len(points) < 2:
         return np.arange(len(points))
     lower, sides = points.min(axis=0), np.ptp(points, axis=0)
@@ -154,15 +149,15 @@ THIN = 1e-15
 def outer_surface(
     corners: Points, pairs: Numbers, holds: Callable[[Points], Which], reach: float
 ) -> tuple[Points, Points]:
-    """Return the surface of a union of closed parts as pieces (n, 3, 3) [m] of triangles, cut where parts meet, with
-    weights (n,) for surface integrals. A piece with both sides inside or both outside has the weight 0, and one of
-    several triangles that lie on each other less than 1.
+    """Return the surface of a union of closed parts, and weights (n,) for surface integrals. The surface consists of
+    triangles (n, 3, 3) [m], which are cut where parts meet. Triangles inside the union have the weight 0, and
+    coincident triangles share one weight.
 
     Args:
         corners: (k, 3, 3) of all triangles, counterclockwise as seen from outside [m].
-        pairs: (m, 2) indices of all triangles that may meet away from their own edges.
-        holds: tests (n,) which points (n, 3) [m] are inside some part.
-        reach: distance from a triangle at which its sides are tested [m].
+        pairs: (m, 2) indices of all triangles that may meet away from their edges.
+        holds: tests (n,) which points (n, 3) [m] are inside a part.
+        reach: distance from a triangle at which its two sides are tested [m].
     """
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
@@ -183,8 +178,8 @@ def outer_surface(
 
 
 def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]:
-    """Cut a triangle (3, 3) into pieces (n, 3, 3) that none of the triangles (m, 3, 3) crosses. Also return for each
-    piece the number (n,) of triangles, including itself, within ``reach`` of its centre."""
+    """Cut a triangle (3, 3) along its intersections with other triangles (m, 3, 3). Return the pieces (n, 3, 3), and
+    the number of triangles (n,) within ``reach`` of each piece's centre."""
     side, normal = corners[1] - corners[0], np.cross(corners[1] - corners[0], corners[2] - corners[0])
     if not normal.any():
         return np.zeros((0, 3, 3)), np.zeros(0)
@@ -206,12 +201,12 @@ def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]
 
 
 def _sides(triangles: Points) -> Points:
-    """Return the sides (3 n, 2, 2) of triangles (n, 3, 3), projected along the last axis."""
+    """Return the edges (3 n, 2, 2) of triangles (n, 3, 3) in the projection along the last axis."""
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)[..., :2].reshape(-1, 2, 2)
 
 
 def _through(triangles: Points) -> Points:
-    """Return the segments (m, 2, 2) in which triangles (n, 3, 3) intersect the plane at height 0."""
+    """Return the line segments (m, 2, 2) where triangles (n, 3, 3) intersect the plane at height 0."""
     heights, following = triangles[..., 2], np.roll(triangles, -1, axis=1)
     crossed = (heights > 0.0) != (following[..., 2] > 0.0)
     along = (heights / np.where(crossed, heights - following[..., 2], 1.0))[..., None]
@@ -219,7 +214,8 @@ def _through(triangles: Points) -> Points:
 
 
 def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
-    """Test (n,) which points (n, 2) are in a triangle (3, 3) seen along the last axis; also return its height (n,)."""
+    """Test (n,) which points (n, 2) are inside a triangle (3, 3) in the projection along the last axis. Also return the
+    height of the triangle at the points (n,)."""
     a, b, c = triangle
     across = (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
     if across == 0.0:
@@ -231,8 +227,6 @@ def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
 
 
 def _pieces(segments: Points, lower: float, upper: float) -> Points:
-    """Return counterclockwise triangles (n, 3, 2) that fill the columns between segments (s, 2, 2) over an interval of
-    the first axis. Columns begin where segments start, end or cross."""
     order = np.argsort(segments[:, :, 0], axis=1)[..., None]
     (start, below), (end, above) = np.moveaxis(np.take_along_axis(segments, order, axis=1), (1, 2), (0, 1))
     leans = end > start
@@ -263,23 +257,24 @@ def _pieces(segments: Points, lower: float, upper: float) -> Points:
 
 
 LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
-"""Increments along two axes of a sequence that fills a square evenly: powers of 1 / p, where p³ = p + 1."""
+"""Increments of a low-discrepancy sequence in a square (Roberts 2018, R2)."""
 BESIDE = 1e-12
-"""Distance from a triangle at which its sides are tested, relative to the length of a mesh."""
+"""Distance from a triangle at which its two sides are tested, relative to the size of the mesh."""
 SEEN = 1e-3
-"""Distance outside the surface at which other parts of the solid are sought, in spacings of surface points."""
+"""Distance outside the surface at which other parts of the solid are sought [spacings of surface points]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Solid):
-    """The solid within closed triangles: all points with a winding number of at least 1. Parts may overlap."""
+    """The solid inside closed triangles: all points with a winding number of at least 1. Parts of the mesh may
+    overlap."""
 
     vertices: Points
-    """(m, 3) [m]"""
+    """Vertices (m, 3) [m]."""
     triangles: Numbers
-    """(k, 3) indices of the vertices of each triangle, counterclockwise as seen from outside."""
+    """Indices of the vertices of each triangle (k, 3), counterclockwise as seen from outside."""
     parts: Sequence[Numbers] = ()
-    """Triangles of each part; empty for one part without crossings."""
+    """Indices of the triangles of each part. Empty if the mesh is one part that does not cross itself."""
     known_trees: Sequence[TriangleTree] = ()
 
     def moved(self, scale: float, shift: Points) -> "Mesh":
@@ -288,7 +283,7 @@ class Mesh(Solid):
 
     @cached_property
     def corners(self) -> Points:
-        """(k, 3, 3) [m]"""
+        """Return the corners of the triangles (k, 3, 3) [m]."""
         return self.vertices[self.triangles]
 
     @property
@@ -307,15 +302,14 @@ class Mesh(Solid):
         return self._ends
 
     def distance(self, points: Points) -> Points:
-        """Return the `Solid.distance`; inside overlapping parts, the depth below the surface of one part, which is too
-        small."""
+        """Return the distances of points from the surface. Where parts overlap, the depth is underestimated."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
         return self._looked_up(points, reach)[1]
 
     def holds(self, points: Points) -> Which:
-        """Test (n,) which points (n, 3) [m] are inside."""
+        """Test (n,) which points (n, 3) [m] are inside the solid."""
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:
@@ -340,8 +334,8 @@ class Mesh(Solid):
         return found, best
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
-        """Return points evenly spread over the triangles by area, for `Solid.own_feet`: one after every equal portion
-        of area along the tree, in a low-discrepancy sequence (Roberts 2018, R2) within each triangle."""
+        """Return points spread evenly over the surface (Roberts 2018, R2), and the outward unit normals at the
+        points."""
         order = np.concatenate([part[tree.order] for part, tree in zip(self._numbers, self._trees, strict=True)])
         areas = self.areas()[order]
         total = areas.sum()
@@ -374,12 +368,12 @@ class Mesh(Solid):
         return enclosed_moments(*outer_surface(self.corners, np.concatenate(pairs), self.holds, reach))
 
     def normals(self) -> Points:
-        """Return unit vectors (k, 3) outwards from each triangle, or 0 for a triangle without area."""
+        """Return the outward unit normals of the triangles (k, 3). The normal of a triangle without area is 0."""
         across = self._across
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
 
     def areas(self) -> Points:
-        """(k,) [m2]"""
+        """Return the areas of the triangles (k,) [m2]."""
         return 0.5 * np.linalg.norm(self._across, axis=1)
 
     @cached_property

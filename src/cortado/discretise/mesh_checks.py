@@ -1,4 +1,4 @@
-"""Checks that turn triangles into a solid, or report what is wrong, where, and the remedy."""
+"""Checks that turn triangles into a solid, or report mistakes and remedies."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,19 @@ from cortado.discretise.shapes import Numbers, Points, Which, whole_origin
 from cortado.errors import InputError
 
 SAME = 1e-6
-"""Largest distance of vertices that are merged to close a mesh, relative to its length."""
+"""Greatest distance between merged vertices, relative to the size of the mesh."""
 COARSE, TOLD = 0.02, 1e-3
-"""Rounding of coordinates in a file above which the file is refused or noted, relative to the length of the mesh."""
+"""Rounding of coordinates above which a file is refused, and above which a note is given, relative to the size of the
+mesh."""
 ASIDE = 1e-6
-"""Distance from a surface at which its sides are tested, relative to the length of the mesh."""
+"""Distance from a surface at which its two sides are tested, relative to the size of the mesh."""
 CROSSED = 1e-7
-"""Smallest depth of a crossing of triangles, relative to the length of the mesh."""
+"""Least depth of crossing triangles, relative to the size of the mesh."""
 LOOKED_AT = 8192
 SAME_WAY = 1e-6
-"""Angle [rad] below which triangles lie on each other, where two bodies touch."""
+"""Greatest angle between coincident triangles at an edge [rad]."""
 TOGETHER = 1e-3
-"""Angle [rad] as `SAME_WAY`, for float32 coordinates, for counting the directions in which a surface continues."""
+"""Greatest angle between directions at an edge that count as one [rad], for float32 coordinates."""
 MEETING = (
     "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
     "says what is inside: delete faces that divide its inside or stick out of it."
@@ -39,11 +40,11 @@ TURNED = (
 @dataclass(frozen=True)
 class Edges:
     ends: Numbers
-    """(e, 2) indices of the edge's vertices, the lower index first."""
+    """Indices of the two vertices of each edge (e, 2), with the lower index first."""
     names: Numbers
-    """(k, 3) index of the edge on each side of the triangles."""
+    """Indices of the edges of each triangle (k, 3)."""
     ways: Numbers
-    """(k, 3) 1 if a side runs from the lower vertex index to the higher, otherwise -1."""
+    """Directions of the edges in each triangle (k, 3): 1 from the lower to the higher vertex index, or -1."""
 
     @classmethod
     def of(cls, triangles: Numbers) -> "Edges":
@@ -56,15 +57,15 @@ class Edges:
 
     @property
     def counts(self) -> Numbers:
-        """Return the number (e,) of triangles at each edge."""
         return np.bincount(self.names.ravel(), minlength=len(self.ends))
 
     def close(self) -> Which:
-        """Test (e,) which edges are closed: equally many triangles run along the edge in both directions."""
+        """Test (e,) which edges are closed. At a closed edge, equally many triangles run along the edge in both
+        directions."""
         return np.asarray(np.bincount(self.names.ravel(), self.ways.ravel(), len(self.ends)) == 0.0)
 
     def check(self, vertices: Points, what: str) -> None:
-        """Raise `InputError` if the triangles are not closed; ``what`` is the name of the mesh."""
+        """Raise `InputError` if an edge is not closed. ``what`` is the name of the mesh."""
         unbalanced, counts = ~self.close(), self.counts
         for wrong, edge, sentence in (
             (unbalanced & (counts > 2), "edge", MEETING),
@@ -84,8 +85,8 @@ def place_in_file(place: Points) -> str:
 
 
 def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
-    """Return vertices (m, 3) and triangles (k, 3), with vertices merged that are equal or closer than ``tolerance``,
-    without triangles that repeat a vertex, duplicates, and pairs back to back."""
+    """Merge vertices closer than ``tolerance``, and remove duplicate and degenerate triangles. Return vertices (m, 3)
+    and triangles (k, 3)."""
     from scipy.spatial import cKDTree
 
     vertices, names = _distinct(vertices)
@@ -101,7 +102,6 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _distinct(vertices: Points) -> tuple[Points, Numbers]:
-    """Return the distinct vertices, and the new index of each vertex."""
     order = np.lexsort(vertices.T)
     new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
     names = np.empty(len(vertices), dtype=np.int64)
@@ -110,16 +110,19 @@ def _distinct(vertices: Points) -> tuple[Points, Numbers]:
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
-    """Return the connected component (count,) of each node; ``links`` (m, 2) are pairs of nodes."""
+    """Return the number of the connected component of each node (count,) in a graph with the edges ``links`` (m, 2)."""
     from trimesh.graph import connected_component_labels
 
     return np.asarray(connected_component_labels(links, count), dtype=np.int64)
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """Return the number (k,) of the body of each triangle (k, 3) of a closed mesh, from 0 on. Neighbours around an edge
-    belong to one body if the solid is between them. Raises `InputError` at an edge from which the surface continues in
-    more than two directions. ``origin`` (3,) is the position of the mesh in the file."""
+    """Divide the triangles of a closed mesh into bodies, and return the number of each triangle's body (k,). Triangles
+    at an edge belong to one body if the solid is between them.
+
+    Raises `InputError` at an edge from which the surface continues in more than two directions. ``origin`` (3,) is the
+    position of the mesh in the file.
+    """
     names = edges.names.ravel()
     sides = np.argsort(names, kind="stable")
     first = np.append(0, np.cumsum(edges.counts))[:-1]
@@ -140,7 +143,6 @@ def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, w
 
 
 def _angles(edge: Points, opposite: Points) -> Points:
-    """Return the right-handed angles (m,) of points (m, 3) around an edge (2, 3)."""
     along = (edge[1] - edge[0]) / np.linalg.norm(edge[1] - edge[0])
     across = np.eye(3)[np.argmin(np.abs(along))]
     right = np.cross(along, across)
@@ -148,8 +150,6 @@ def _angles(edge: Points, opposite: Points) -> Points:
 
 
 def _directions(angles: Points, ways: Numbers) -> int:
-    """Return in how many directions a surface continues from an edge, with triangles at ``angles`` (m,) [rad] and with
-    orientations ``ways`` (m,); triangles that lie on each other with opposite orientations cancel."""
     order = np.argsort(angles)
     angles, ways = angles[order], ways[order]
     groups = np.cumsum(np.diff(angles, prepend=angles[0]) > TOGETHER)
@@ -158,8 +158,7 @@ def _directions(angles: Points, ways: Numbers) -> int:
 
 
 def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
-    """Return the pairs (m / 2, 2) of triangles around an edge (m,) that bound the same wedge of solid: one starts the
-    wedge, and the next one in ``ends`` (m,) ends it. Of two that lie on each other, the ending one comes first."""
+    """Return the pairs of triangles at an edge (m / 2, 2) that enclose a wedge of the solid."""
     turned = np.mod(angles - angles[np.argmin(ends)] + 0.5 * SAME_WAY, 2.0 * np.pi)
     order = np.lexsort((~ends, np.floor(turned / SAME_WAY)))
     begun, ended, pairs = list[int](), list[int](), []
@@ -175,8 +174,8 @@ def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
 def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
-    """Sort triangles into parts whose bodies do not overlap; return no parts if the mesh does not cross itself. Also
-    return a triangle at which a body crosses itself, and a triangle of a body inside another, or None.
+    """Sort triangles into parts without overlapping bodies. No parts are returned if the mesh does not cross itself.
+    Also return a triangle where a body crosses itself, or None, and a triangle of a body inside another body, or None.
 
     Args:
         mesh: closed.
@@ -184,7 +183,7 @@ def parts_of(
         labels: (k,) the body of each triangle.
         crossings: (m, 2) pairs of triangles that cross.
         some: (s,) triangles, including for each body at least one with an area.
-        beside: (s, 3) a point just outside each of these triangles [m].
+        beside: (s, 3) a point just outside each triangle in ``some`` [m].
     """
     count = int(labels.max()) + 1
     bodies = [np.flatnonzero(labels == body) for body in range(count)]
@@ -219,8 +218,8 @@ def parts_of(
 
 
 def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
-    """Return the owner (bodies,) of each body: for a cavity the smallest body around it, for others the body.
-    ``around`` (bodies, s) are each body's winding numbers at points beside the bodies ``seen`` (s,)."""
+    """Return the owner of each body (bodies,). The owner of a cavity is the smallest body around the cavity. Any other
+    body is its own owner."""
     owners = np.arange(len(volumes))
     for cavity in np.flatnonzero(volumes < 0.0):
         holds = (around[:, seen == cavity] > 0).all(axis=1) & (volumes > -volumes[cavity])
@@ -231,7 +230,7 @@ def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
 
 
 def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
-    """Divide numbers into few groups, largest first, such that ``met`` is False for any two in a group."""
+    """Divide indices into few groups. ``met`` is False for any two indices in a group."""
     groups: list[list[int]] = []
     for number in sorted(range(len(sizes)), key=lambda one: -sizes[one]):
         free = next((group for group in groups if not met[number, group].any()), None)
@@ -243,7 +242,8 @@ def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
 
 
 def _volume(corners: Points) -> float:
-    """Return the volume within a closed surface of triangles (k, 3, 3) [m3]; negative if its normals point inwards."""
+    """Return the volume inside a closed surface of triangles (k, 3, 3) [m3]. It is negative if the normals point
+    inwards."""
     a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
     return float((a * np.cross(b, c)).sum() / 6.0)
 
@@ -251,16 +251,16 @@ def _volume(corners: Points) -> float:
 @dataclass(frozen=True, eq=False)
 class FoundMesh:
     mesh: Mesh
-    """Mesh in the file's unit of length, relative to ``origin``."""
+    """The mesh in the file's unit of length, relative to ``origin``."""
     origin: Points
-    """(3,) position in the file: near the middle of a mesh far from the file's origin, otherwise 0."""
+    """Position (3,) of the mesh in the file, which is 0 for a mesh near the file's origin."""
     notes: tuple[str, ...]
     left_out: int
 
 
 def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float = 0.0) -> FoundMesh:
-    """Build the solid enclosed by triangles (k, 3) with vertices (m, 3), whose coordinates are multiples of
-    ``rounding`` unless that is 0; raise `InputError` if they enclose none. ``what`` is the name of the mesh."""
+    """Build the solid inside triangles (k, 3) with vertices (m, 3), or raise `InputError`. ``rounding`` is the rounding
+    step of the coordinates, or 0. ``what`` is the name of the mesh."""
     used = vertices[triangles.ravel()]
     if not np.isfinite(used).all():
         wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
@@ -300,8 +300,8 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
 def _solid_parts(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, origin: Points, what: str
 ) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
-    """Return the parts of a closed mesh, whose bodies have ``labels`` (k,), and notes; raise `InputError` if the mesh
-    is inside out. ``origin`` (3,) is the mesh's position in the file."""
+    """Return the parts of a closed mesh, and notes for the user. ``labels`` (k,) is the body of each triangle. Raises
+    `InputError` if the mesh is inside out."""
     size = np.ptp(mesh.corners, axis=(0, 1)).max()
     crossings = tree.crossings(mesh.triangles, CROSSED * size)
     some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))
@@ -329,8 +329,6 @@ def _solid_parts(
 
 
 def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
-    """Return the error message for inward normals. Of the tested triangles, ``wrong`` marks those with inward normals,
-    and ``seen`` has their bodies; ``corners`` (3, 3) are an example."""
     if wrong.all():
         return (
             f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "

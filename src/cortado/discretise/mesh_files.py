@@ -1,4 +1,4 @@
-"""Solids from files of triangles, read by trimesh, with checks of their unit of length and thickness."""
+"""Read solids from triangle files with trimesh, and check their unit of length and wall thickness."""
 
 import re
 import warnings
@@ -18,16 +18,16 @@ from cortado.files.disk import cached_by_file, reason
 SUFFIXES = (".stl", ".obj", ".ply", ".gltf", ".glb")
 MOST_BYTES = 2**30
 LEAST_THICKNESS = 0.5
-"""Smallest allowed thickness of a wall [spacings]; water leaks through walls of 0.2."""
+"""Least allowed wall thickness [spacings]. Water leaks through walls of 0.2 spacings."""
 SHARE = 0.01
 ALONG = 0.9
-"""Smallest cosine between one side of a sheet and the reversed other side; wedges have a smaller cosine."""
+"""Least cosine between the normals of opposite surfaces of a sheet, with one normal reversed."""
 TOO_LARGE = 100.0
-"""Size, relative to the container or to 100 spacings, above which a mesh seems to be in another unit."""
+"""Relative size above which a mesh seems to be in a wrong unit. The scale is the container or 100 spacings."""
 PROBES, STEPS, HALVINGS = 20_000, 16, 12
-"""Number of surface points where thickness is measured, of steps for each, and of bisections of the last step."""
+"""Numbers in the measurement of thickness: surface points, steps for each point, and bisections of the last step."""
 BEYOND = 1e-3
-"""Distance behind a solid from which its back is tested, relative to the length of the steps."""
+"""Distance behind a solid for tests of its back, relative to the length of a step."""
 
 
 def read_mesh(
@@ -37,17 +37,15 @@ def read_mesh(
     support: float | None = None,
     container: tuple[Points, Points] | None = None,
 ) -> Mesh:
-    """Read the solid in a file, and check it for particles with a spacing [m] and a support [m].
-
-    Raises `InputError` with the file, what is wrong, where, and the remedy; warns with `CortadoWarning` about features
-    that are probably unintended.
+    """Read the solid in a file and check it. Raises `InputError` with the file, the mistake and the remedy. Warns with
+    `CortadoWarning` about probably unintended features.
 
     Args:
         path: the file's path.
-        scale: factor of its lengths, such as 0.001 for millimetres.
-        spacing: [m].
-        support: [m]; None for a body of fluid, which may have any thickness.
-        container: lower and upper corner, each (3,) [m], of the box around the container; None without a container.
+        scale: factor for the lengths in the file, such as 0.001 for millimetres.
+        spacing: particle spacing [m].
+        support: support radius [m]. None for a region of fluid, which may have any thickness.
+        container: lower and upper corner, each (3,) [m], of the box around the container. None without a container.
     """
     found, what = mesh_in_file(path), repr(path)
     mesh = found.mesh.moved(scale, np.zeros(3))
@@ -65,8 +63,8 @@ def mesh_in_file(path: str) -> FoundMesh:
 
 
 def triangles_in_file(path: str) -> tuple[Points, Numbers]:
-    """Read the vertices (m, 3), in the file's unit, and triangles (k, 3) of a possibly open surface; raise
-    `InputError`."""
+    """Read the vertices (m, 3) and the triangles (k, 3) of a surface, which may be open. Vertices are in the file's
+    unit."""
     vertices, triangles, _ = read_triangles(path)
     if not np.isfinite(vertices).all():
         raise InputError(f"{path!r} has a vertex that is not finite: export the mesh once more.")
@@ -74,8 +72,8 @@ def triangles_in_file(path: str) -> tuple[Points, Numbers]:
 
 
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
-    """Read the vertices (m, 3) and at least one triangle (k, 3) of all bodies in a file, placed as in the file's scene,
-    in its unit of length. Also return the rounding step of coordinates, 0 if not float32. Raises `InputError`."""
+    """Read the vertices (m, 3) and the triangles (k, 3) of all bodies in a file. Vertices are in the file's unit. Also
+    return the rounding step of float32 coordinates, or 0. Raises `InputError` if there are no triangles."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
     if not Path(path).stat().st_size:
@@ -104,7 +102,7 @@ def read_triangles(path: str) -> tuple[Points, Numbers, float]:
 
 
 def _is_single(path: str) -> bool:
-    """Test whether a file's coordinates are float32: a binary STL, glTF, or a PLY without doubles."""
+    """Test whether the coordinates of a file are float32."""
     suffix = Path(path).suffix.lower()
     if suffix in (".stl", ".ply"):
         with open(path, "rb") as file:
@@ -148,11 +146,11 @@ def _check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: 
 @dataclass(frozen=True)
 class Thickness:
     points: Points
-    """(n, 3) [m]"""
+    """Points on the surface (n, 3) [m]."""
     lengths: Points
-    """(n,) length from the point straight through the solid [m]; infinite if not found."""
+    """Length of the straight line from each point through the solid (n,) [m], or infinity if it is not found."""
     is_sheet: np.ndarray
-    """(n,) True if the surface on the other side is nearly parallel."""
+    """Mask (n,) of the points with a nearly parallel opposite surface."""
 
     def share(self, which: np.ndarray) -> float:
         return float(np.count_nonzero(which) / max(len(which), 1))
@@ -163,7 +161,8 @@ class Thickness:
 
     @property
     def thinnest(self) -> float:
-        """Return the thickness of sheets [m] that all but `SHARE` of the surface exceeds; infinite without sheets."""
+        """Return the thickness of sheets [m], ignoring the thinnest fraction `SHARE` of the surface. Infinite without
+        sheets."""
         return float(np.quantile(np.where(self.is_sheet, self.lengths, np.inf), SHARE, method="higher"))
 
 
@@ -182,8 +181,8 @@ def thickness_of(mesh: Mesh, reach: float) -> Thickness:
 
 
 def _thickness_notes(mesh: Mesh, origin: Points, what: str, spacing: float, support: float) -> Iterator[str]:
-    """Yield sentences about a mesh that is thin compared with the support [m]; raise `InputError` if fluid would pass.
-    ``origin`` (3,) is the mesh's position in the file, times the scale [m]."""
+    """Yield notes on a mesh with thin walls. ``support`` is the support radius [m]. Raises `InputError` if the walls
+    would leak."""
     found, least = thickness_of(mesh, support), LEAST_THICKNESS * spacing
     found = replace(found, points=origin + found.points)
     sheet, sharp = (found.lengths < least) & found.is_sheet, (found.lengths < least) & ~found.is_sheet

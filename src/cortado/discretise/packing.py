@@ -1,8 +1,8 @@
-"""Packing of particles until the fluid has its rest density everywhere, in float64.
+"""Packing: particles are moved until the fluid has its rest density everywhere, in float64.
 
-Colagrossi et al. (2012) and Negi and Ramachandran (2021) use repulsion. This packing instead solves nonlinear least
-squares (Gauss-Newton), which give every particle the density of the lattice and keep close pairs apart. Walls count
-with their weights, and air counts as fluid.
+Each round solves a nonlinear least-squares problem (Gauss-Newton). It moves the density of every particle towards the
+lattice's density and keeps close pairs apart. Walls count with their weights, and air counts as fluid. Colagrossi et
+al. (2012) and Negi and Ramachandran (2021) use repulsion instead.
 """
 
 from contextlib import nullcontext
@@ -25,33 +25,33 @@ NO_LIMIT = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class PointsAround:
-    """Neighbours of particles, found by cells: first the particles, if any, then fixed points of air and walls."""
+    """A neighbour search for particles by cells. The points are the particles, followed by fixed points of air and
+    walls."""
 
     lattice: RestLattice
     points: Points
-    """(m, d) [m]"""
+    """Points (m, d) [m]."""
     weights: Points
-    """(m,) relative to a particle [-]"""
+    """Weights of the points (m,), relative to a particle [-]."""
     air: tuple[int, int]
-    """Index of the first point of air, which ``blind`` particles do not see, and index after the last."""
+    """First index of the points of air, and the index after the last. ``blind`` particles ignore air."""
     lengths: Points
-    """(d,) [m]; 0 along other axes"""
+    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
     reach: float
-    """[m]"""
+    """Search radius [m]."""
 
     def near(self, particles: Points) -> Which:
-        """Test (n,) which particles (n, d) [m] have a point within the reach."""
+        """Test (n,) which particles (n, d) [m] have a point within the search radius."""
         return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
 
     def sums(self, particles: Points, blind: Which) -> Points:
-        """Return the sums (n,) of weighted kernels [1 / m^d] at particles (n, d) [m]; ``blind`` (n,) ones do not see
-        air."""
+        """Return the sums of weighted kernels (n,) [1 / m^d] at particles (n, d) [m]. Particles in ``blind`` (n,)
+        ignore air."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
-        """Return neighbour lists of the first n points, now at ``particles`` (n, d) [m]: start (n,) and end (n,) of
-        each list, and indices of neighbours. A list has only points of higher index within the reach; between lists are
-        gaps."""
+        """Return the neighbour lists of particles (n, d) [m]: the start (n,) and end (n,) of each list, and the indices
+        of neighbours. A list has only neighbours with a higher index than the particle."""
         room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
@@ -74,7 +74,7 @@ class PointsAround:
 
     @property
     def volume(self) -> float:
-        """Return the volume of a particle [m^d] that gives the lattice its rest density."""
+        """Return the volume of a particle in the lattice at rest density [m^d]."""
         return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
     @cached_property
@@ -118,30 +118,29 @@ class PointsAround:
 
 
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
-"""Bounds on the relative excess of a packed particle's density; with more, pressure would drive particles apart."""
+"""Greatest, desired and least relative density excess of a packed particle."""
 ROUNDS = 6
 LISTED = 0.6
-"""Distance beyond the support within which pairs are listed, for later rounds [spacings]."""
 NEAR = 0.9
 """Distance below which pairs of particles repel each other [spacings]."""
 PUSH = 0.1
-"""Weight of a pair that is one spacing too close, relative to a density error of 100 %."""
+"""Weight of close pairs in the least-squares problem, relative to density errors."""
 FARTHEST = 0.15
-"""Largest move of a particle in a round, in which the linearisation holds [spacings]."""
+"""Greatest move of a particle in a round [spacings]."""
 DAMPING, MOST_INNER_ROUNDS = 0.02, 20
-"""Damping of the linear least squares, which prefers small moves, and most iterations."""
+"""Damping and greatest number of iterations of the linear least-squares problem."""
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return the relative excess (n,) of densities from sums of kernels (n,) [1 / m^d]; 0 or more for ``stays``
-    (n,)."""
+    """Return the relative density excess (n,), given the sums of kernels (n,) [1 / m^d]. It is at least 0 where
+    ``stays`` (n,) is true."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
 
 class Relaxation:
-    """Least-squares problem for the positions of the first n of the points around, of which the ``free`` (n,) ones move
-    and the ``stays`` (n,) ones do not see air. Pairs are listed once, because moves are small."""
+    """The least-squares problem for the positions of n particles. Particles in ``free`` (n,) move, and particles in
+    ``stays`` (n,) ignore air."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
@@ -184,8 +183,8 @@ class Relaxation:
         return np.asarray(found.reshape(-1, 3))
 
     def linearise(self, close: float) -> None:
-        """Compute the sums (n,) [1 / m^d] and the distances (m,) [m] of pairs closer than ``close`` [m], and their
-        derivatives, at the current positions."""
+        """Compute the sums of kernels (n,) [1 / m^d], and the distances (m,) [m] of pairs closer than ``close`` [m].
+        Also compute the derivatives of the sums and the distances."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
         at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
         self.sums, distances = np.full(count, at_its_place), np.empty(most)
@@ -205,7 +204,8 @@ class Relaxation:
         self.distances = distances[: close_starts[-1]]
 
     def multiply(self, moves: Points) -> tuple[Points, Points]:
-        """Return the changes of the sums (n,) [1 / m^d] and of the distances (m,) [m] for moves (n, 3) [m]."""
+        """Return the changes of the sums of kernels (n,) [1 / m^d] and of the pair distances (m,) [m] for moves (n, 3)
+        [m]."""
         changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
         self._launch(self._around.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
         return changes, approaches
@@ -220,46 +220,44 @@ class Relaxation:
 
 
 MOST_LOOKS, MOST_ROUNDS = 12, 36
-"""Most checks of all particles, and most least-squares rounds after each check."""
+"""Greatest number of checks of all particles, and of least-squares rounds after each check."""
 COMPRESSED, DIGITS = 0.03, 6
-"""Relative excess of density above which a particle may be removed, and decimals to which excesses are compared."""
+"""Relative density excess above which a particle may be removed, and decimal places of comparisons."""
 BESIDE, MOST_OUT = 10.0, 40
-"""Distance [supports] within which one particle is removed at a time, and most removals."""
+"""Least distance between two particles that are removed together [support radii], and greatest number of removals."""
 ROUND_OFF = 1e-9
-"""Relative tolerance of distances between lattice neighbours."""
 MANY = 20_000
 GRAINS = 2.0**13
-"""Moves are multiples of 1 / `GRAINS` spacings, which hides round-off that differs between machines."""
+"""Inverse of the rounding step of moves [1 / spacings]. Rounding hides differences between machines."""
 
 
 @dataclass(frozen=True)
 class Packing:
     lattice: RestLattice
     fixed: Points
-    """(m, d) points of air, then of walls [m]."""
+    """Fixed points (m, d) [m]. Points of air come before points of walls."""
     weights: Points
-    """(m,) relative to a particle [-]"""
+    """Weights of the fixed points (m,), relative to a particle [-]."""
     air: int
-    """Number of points of air, which come first."""
+    """Number of points of air."""
     lengths: Points
-    """(d,) [m]; 0 along other axes"""
+    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
 
     def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Return rest positions (m, d) [m] of particles (n, d) [m], and the indices (m,) of the particles for which
-        there is room. Particles in ``stays`` (n,) do not move. The last few results are cached."""
+        """Return rest positions (m, d) [m] of particles (n, d) [m], and the indices (m,) of the remaining particles.
+        Particles in ``stays`` (n,) do not move. The last few results are cached."""
         arrays = self.fixed, self.weights, self.lengths, particles, stays
         found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
-        """Return the relative excess (m,) of density over the lattice's for ``some`` of particles (n, d) [m]. For
-        particles in ``stays`` (n,), air does not count and the excess is at least 0."""
+        """Return the relative density excess over the lattice (m,) for ``some`` of the particles (n, d) [m]. Particles
+        in ``stays`` (n,) ignore air and have an excess of at least 0."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Pack particles as `packed` says; of compressed ones, remove those at least as compressed as their
-        neighbours."""
+        """Pack particles like `packed`, without the cache. Particles that remain too compressed are removed."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             crowded = self._crowded(found, stays[kept])
@@ -271,8 +269,7 @@ class Packing:
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
     def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """Return the indices (m,) of free, compressed particles that are at least as compressed as all free
-        neighbours."""
+        """Return the indices (m,) of free, compressed particles whose free neighbours are less compressed."""
         errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
         over = np.flatnonzero((errors > COMPRESSED) & ~stays)
         points, reach = particles[over], BESIDE * self.lattice.support
@@ -291,7 +288,7 @@ class Packing:
         return found
 
     def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
-        """Return particles (n, d) [m] after moves in the neighbourhood of the particles in ``wrong`` (n,)."""
+        """Move the particles near a particle marked in ``wrong`` (n,), and return all positions (n, d) [m]."""
         support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
         movable = self._near(particles, wrong, near) & ~stays
         region = self._near(particles, movable, support)
@@ -314,14 +311,13 @@ class Packing:
         return np.asarray((errors > HIGHEST) | (errors < LOWEST))
 
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
-        """Test (n,) which particles are at most ``reach`` [m] from a selected particle."""
+        """Test (n,) which particles are at most ``reach`` [m] from a particle marked in ``some``."""
         others = particles[some]
         weights, reach = np.ones(len(others)), reach * (1.0 + ROUND_OFF)
         found = PointsAround(self.lattice, others, weights, (0, 0), self.lengths, reach)
         return found.near(particles)
 
     def _around(self, particles: Points, reach: float) -> PointsAround:
-        """Return the neighbours of particles (n, d) [m] within ``reach`` [m]: other particles, and the fixed points."""
         count = len(particles)
         points, weights = np.concatenate([particles, self.fixed]), np.append(np.ones(count), self.weights)
         return PointsAround(self.lattice, points, weights, (count, count + self.air), self.lengths, reach)
@@ -333,7 +329,6 @@ class Packing:
 
 @lru_cache(maxsize=8)
 def _packed(lattice: RestLattice, shape: tuple[int, int], air: int, *arrays: bytes) -> tuple[Points, Numbers]:
-    """Call `Packing.settled` with a cache, as scenes are often simulated more than once."""
     *numbers, stays = arrays
     fixed, weights, lengths, particles = (np.frombuffer(one) for one in numbers)
     packing = Packing(lattice, fixed.reshape(-1, shape[1]), weights, air, lengths)

@@ -1,7 +1,7 @@
 """Kernels of the packing, in float64: neighbour search, densities, and products with derivatives.
 
-A pair appears once, in the list of its first particle, and adds to the sums of both particles. Kernels over pairs
-therefore run in one thread, with a fixed order, and add by a read and a write, as ``+=`` is a slower atomic addition.
+Each pair is listed once and adds to the sums of both particles. Kernels over pairs therefore run in one thread, in a
+fixed order and without atomic additions.
 """
 
 from functools import cache
@@ -23,58 +23,55 @@ cell_of, wrap, below, above = _cells.cell_of, _cells.wrap, _cells.below, _cells.
 
 @wp.struct
 class Around:
-    """Neighbours of particles, with their weights in the density."""
+    """The points around particles, with their weights in the density."""
 
     x: wp.array(dtype=vector)
-    """[m]"""
+    """Positions [m]."""
     weights: wp.array(dtype=real)
-    """relative to a particle [-]"""
+    """Weights, relative to a particle [-]."""
     air: wp.int32
-    """Index of the first point of air, which blind particles do not see, and index after the last."""
+    """First index of the points of air, and the index after the last. Some particles ignore air."""
     behind_air: wp.int32
     is_periodic: wp.bool
     period: vector
-    """[m]; 0 without period"""
+    """Lengths of the periodic box [m]. They are 0 along axes without a period."""
     frequency: vector
-    """1 / period [1/m]"""
+    """Inverse lengths of the periodic box [1/m]."""
     per_support: real
-    """1 / h [1/m]"""
+    """Inverse support radius [1/m]."""
     normalisation: real
-    """sigma [1 / m^d]"""
+    """Normalisation of the smoothing kernel [1 / m^d]."""
 
 
 @wp.struct
 class Placed:
-    """Points in the order of their cells."""
+    """Points sorted by cell."""
 
     x: wp.array(dtype=vector)
-    """[m]"""
     numbers: wp.array(dtype=wp.int32)
-    """Indices of the points."""
 
 
 @wp.struct
 class Equations:
-    """Derivatives of densities and of the distances of close pairs. Pairs with at least one free particle are stored in
-    lists; the pairs of particle i begin at ``starts[i]``."""
+    """Derivatives of densities and of the distances of close pairs. The pairs of particle i begin at ``starts[i]``."""
 
     starts: wp.array(dtype=wp.int32)
     others: wp.array(dtype=wp.int32)
-    """Second particle of each pair within the support."""
+    """Second particle of each pair within the support radius."""
     gradients: wp.array(dtype=vector)
-    """Derivative of a pair's kernel with respect to its separation [1 / m^(d + 1)]."""
+    """Derivative of each pair's smoothing kernel with respect to the separation [1 / m^(d + 1)]."""
     own: wp.array(dtype=vector)
-    """Derivative of a particle's sum over fixed points with respect to its position [1 / m^(d + 1)]."""
+    """Gradient of each particle's sum over fixed points [1 / m^(d + 1)]."""
     close_starts: wp.array(dtype=wp.int32)
     close_others: wp.array(dtype=wp.int32)
     """Second particle of each close pair."""
     directions: wp.array(dtype=vector)
-    """Unit vectors from the second particle to the first."""
+    """Unit vectors from the second to the first particle of close pairs."""
 
 
 @wp.func
 def separation(x_i: vector, x_j: vector, around: Around) -> vector:
-    """Return the separation x_i - x_j to the nearest image [m]."""
+    """Return the separation from x_j to x_i, or to the nearest periodic image [m]."""
     x_ij = x_i - x_j
     if around.is_periodic:
         s = wp.cw_mul(x_ij, around.frequency)
@@ -84,8 +81,7 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
 
 @cache
 def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
-    """Build the kernels of a packing, and the structs ``around``, ``placed``, ``grid`` and ``equations`` of their
-    arguments."""
+    """Build the kernels of a packing and the structs ``around``, ``placed``, ``grid`` and ``equations``."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
@@ -98,9 +94,11 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     def look_around(
         first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
-        """Count the points ``around`` within ``reach`` of particles at x, up to ``most``; list them from ``starts`` on
-        while there is room; and sum their weighted kernels. ``blind`` particles do not see air. If ``are_own``,
-        particle i is point i, and only later points count."""
+        """List the points within ``reach`` of each particle, and sum their weighted smoothing kernels.
+
+        At most ``most`` points are listed for each particle. Particles in ``blind`` ignore air. If ``are_own`` is true,
+        particle i is also point i, and only points with a higher index count.
+        """
         i = first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -127,8 +125,8 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
-        """Add the kernels of each particle and its ``listed`` neighbours to the ``sums`` of both. Append pairs with a
-        free particle to the ``equations``, and the distances of pairs closer than ``close`` [m]."""
+        """Add the smoothing kernel of each listed pair to the ``sums`` of both particles. Pairs with a free particle
+        are appended to ``equations``. Distances of pairs closer than ``close`` [m] are appended to ``distances``."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)
@@ -181,7 +179,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def multiply_back(equations, changes, approaches, moves):
-        """Add the product of changes and approaches with the transposed derivatives to the moves."""
+        """Add the vector-Jacobian product of the equations to ``moves``."""
         i = wp.tid()
         change = changes[i]
         move = change * equations.own[i]

@@ -9,7 +9,8 @@ from cortado.discretise.shapes import corners as corners_of
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments, nearest_on_edges
 
 FACING = 0.9
-"""Smallest cosine between one side of a polygon and the reversed other side at which the two form a sheet."""
+"""Least cosine between the directions of two opposite sides of a polygon that form a sheet, with one direction
+reversed."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class Box(Solid):
     """A box centred at the origin, with sides along the axes."""
 
     half: Points
-    """(d,) half of its sides [m]."""
+    """Half of the side lengths (d,) [m]."""
 
     def extent(self) -> tuple[Points, Points]:
         return -self.half, self.half
@@ -45,12 +46,12 @@ class Box(Solid):
 
 @dataclass(frozen=True)
 class Round(Solid):
-    """All points within a radius of a segment centred at the origin: a capsule, a sphere or, in 2-D, a disc."""
+    """A capsule, sphere or disc: all points within a radius of a line segment centred at the origin."""
 
     half: Points
-    """(d,) vector from the middle of the segment to its end [m]."""
+    """Vector from the middle to the end of the segment (d,) [m]."""
     radius: float
-    """[m]"""
+    """Radius [m]."""
 
     def extent(self) -> tuple[Points, Points]:
         reach = np.abs(self.half) + self.radius
@@ -94,10 +95,10 @@ class Round(Solid):
 
 @dataclass(frozen=True)
 class Revolved(Solid):
-    """A solid of revolution about an axis of space through the origin."""
+    """A solid of revolution about a coordinate axis."""
 
     profile: Solid
-    """Cross-section through the axis, in 2-D, with straight edges: coordinates across the axis and along it."""
+    """Plane cross-section through the axis, with straight edges. The first coordinate is the distance from the axis."""
     axis: int
 
     def extent(self) -> tuple[Points, Points]:
@@ -122,23 +123,23 @@ class Revolved(Solid):
         return revolved_moments(outer_edges(self.profile.faces(np.inf)), self.axis)
 
     def _flat(self, points: Points) -> Points:
-        """Return distances from the axis, and heights, (n, 2) [m]."""
+        """Return the distances from the axis and the heights of points (n, 2) [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
         return np.column_stack([across, points[:, self.axis]])
 
 
 @dataclass(frozen=True)
 class HalfSpace(Solid):
-    """A half space, all points below a plane; pictures show only its part inside a box."""
+    """All points below a plane. Pictures show only the points inside a box."""
 
     normal: Points
-    """(d,) unit vector upwards"""
+    """Upward unit vector (d,)."""
     height: float
-    """[m] along the normal"""
+    """Height of the plane along the normal [m]."""
     lower: Points
-    """(d,) [m]"""
+    """Lower corner of the box (d,) [m]."""
     upper: Points
-    """(d,) [m]"""
+    """Upper corner of the box (d,) [m]."""
 
     @property
     def is_bounded(self) -> bool:
@@ -165,10 +166,10 @@ class HalfSpace(Solid):
 
 @dataclass(frozen=True)
 class Polygon(Solid):
-    """A polygon in 2-D, whose sides do not cross."""
+    """A polygon in 2-D without crossing sides."""
 
     corners: Points
-    """(m, 2) [m], clockwise or counterclockwise."""
+    """Corners (m, 2) [m], clockwise or counterclockwise."""
 
     def extent(self) -> tuple[Points, Points]:
         return self.corners.min(axis=0), self.corners.max(axis=0)
@@ -189,8 +190,7 @@ class Polygon(Solid):
         return enclosed_moments(edges, np.full(len(edges), -1.0 if clockwise else 1.0))
 
     def thinnest(self) -> float:
-        """Return the smallest thickness [m] between facing sides without a common corner; infinite without facing
-        sides."""
+        """Return the least thickness between opposite sides of the polygon [m], or infinity."""
         starts, sides = self.corners, np.roll(self.corners, -1, axis=0) - self.corners
         lengths = np.linalg.norm(sides, axis=1)
         along = sides / lengths[:, None]
@@ -211,7 +211,7 @@ class Polygon(Solid):
         return found
 
     def _holds(self, points: Points) -> Which:
-        """Test (n,) which points are inside, by the number of sides that a ray along the first axis crosses."""
+        """Test (n,) which points are inside, by counting the crossings of a ray along the first axis with the sides."""
         inside = np.zeros(len(points), dtype=bool)
         for (x_0, y_0), (x_1, y_1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
             if y_0 == y_1:
@@ -231,8 +231,8 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """Return the faces of the part of a box, between corners (d,) [m], below a plane at ``height`` [m] along its normal
-    (d,)."""
+    """Return the faces of the part of a box below a plane. The plane has the unit vector ``normal`` (d,) and lies at
+    ``height`` [m] along this vector."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -250,7 +250,7 @@ def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -
 
 
 def polygon_faces(corners: Points) -> Faces:
-    """Return the edges of a polygon (m, 2) [m], given clockwise or counterclockwise."""
+    """Return the edges of a polygon with corners (m, 2) [m], given clockwise or counterclockwise."""
     following = np.roll(corners, -1, axis=0)
     (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
     area = (x * y_next - x_next * y).sum()
@@ -260,15 +260,15 @@ def polygon_faces(corners: Points) -> Faces:
 
 
 def arc(centre: Points, radius: float, start: float, end: float, fine: float) -> Points:
-    """Return points (m, 2) [m] of an arc from one angle to another [rad], about ``fine`` [m] apart."""
+    """Return points of a circular arc (m, 2) [m], about ``fine`` [m] apart. ``start`` and ``end`` are angles [rad]."""
     count = max(int(np.ceil(abs(end - start) * radius / fine)), 4)
     angles = np.linspace(start, end, count + 1)
     return centre + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
-    """Return the faces, about ``fine`` [m] wide, of a solid of revolution about an axis of space. The profile is the
-    cross-section through the axis, symmetric about the axis."""
+    """Return the faces of a solid of revolution, about ``fine`` [m] wide. The profile is the cross-section through the
+    axis of revolution, and is symmetric about the axis."""
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -290,33 +290,34 @@ def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
 
 
 def outer_edges(profile: Faces) -> Points:
-    """Return starts and ends (k, 2, 2) [m] of the edges of a profile, cut off at the axis."""
+    """Return the edges of a profile on one side of the axis, as start and end points (k, 2, 2) [m]."""
     edges = profile.vertices[profile.corners]
     return np.array([[_cut(start, end), _cut(end, start)] for start, end in edges if max(start[0], end[0]) > 0.0])
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """Return the start (2,) of an edge, or the edge's intersection with the axis if the start is beyond."""
+    """Return the start (2,) of an edge, or the edge's intersection with the axis."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
 
 
 NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
-"""Nodes of three-point Gauss quadrature on [0, 1], exact for polynomials of degree 5."""
+"""Nodes of three-point Gauss quadrature on the interval from 0 to 1."""
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
 def revolved_moments(edges: Points, axis: int) -> Moments:
-    """Return the moments of a solid of revolution about an axis of space, from the edges (k, 2, 2) [m] of its profile
-    on one side of the axis. Coordinates are radius and height; edges run counterclockwise, and edges on the axis may be
-    left out."""
+    """Return the moments of a solid of revolution, given the edges of its profile (k, 2, 2) [m] on one side of the
+    axis. The coordinates are radius and height. The edges run counterclockwise, and edges on the axis may be left out.
+    """
     height = edges[..., 1].mean()
     start, end = edges[:, 0], edges[:, 1]
     x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
 
     def integral(p: int, q: int) -> float:
-        """Return the integral of x^p (y - height)^q over the profile, by Green's theorem."""
+        """Return the integral of x^p (y - height)^q over the profile, with radius x and height y, by Green's
+        theorem."""
         return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
 
     volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[axis]
@@ -327,15 +328,14 @@ def revolved_moments(edges: Points, axis: int) -> Moments:
 
 
 def _standing(direction: Points) -> Points:
-    """Return the rotation matrix (d, d) that rotates the last axis to a unit vector (d,)."""
+    """Return a rotation matrix (d, d) that rotates the last axis to a unit vector (d,)."""
     frame = np.stack([*across(direction), direction], axis=1)
     frame[:, 0] *= np.linalg.det(frame)
     return frame
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """Return the lattice ``lower + (i + 1/2) spacing`` [m] in the box around a solid, or up to half a spacing
-    beyond."""
+    """Return a lattice of points that covers the box around a solid."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 

@@ -1,5 +1,5 @@
-"""The room for fluid: inside the region of a container, outside of solids, and within one period of periodic axes.
-Points are (n, d) [m]; distances (n,) [m] are negative inside."""
+"""The room for fluid: the inside of a container without solids, within one period of periodic axes. Points are (n, d)
+[m]. Distances (n,) [m] are negative inside."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,27 +13,26 @@ from cortado.discretise.shapes import Points, apart, wrapped
 from cortado.discretise.solid import Placed, Solid
 
 TOLERANCE = 0.5
-"""Largest distance of a particle outside its container [spacings], from which walls push it back; light fluid among
-heavier fluid is pressed out so far at times."""
+"""Greatest distance of a particle outside its container [spacings]. Walls push particles within this distance back."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A convex region in d dimensions; by default all of space."""
+    """A convex region in d dimensions, by default all of space."""
 
     lower: Points
-    """(d,) [m]"""
+    """Lower corner (d,) [m]."""
     upper: Points
-    """(d,) [m]"""
+    """Upper corner (d,) [m]."""
     base: Points
-    """(d,) point on the axis of the cylinder [m]."""
+    """Point on the axis of the cylinder, or centre of the sphere (d,) [m]."""
     across: Points
-    """(d,) 1 for the axes of space across the cylinder, 0 for the axis along it. All are 0 without a cylinder, and 1
-    for a sphere, whose centre is ``base``."""
+    """Mask of axes (d,): 1 for axes perpendicular to the cylinder's axis and for all axes of a sphere, and 0 for any
+    other axis."""
     radius: float = np.inf
     """Radius of the cylinder or sphere [m]."""
     rim: float = np.inf
-    """Height of the open end of a cylinder along its axis [m]; infinite if it has a lid."""
+    """Height of an open cylinder's rim along its axis [m], or infinity for a cylinder with a lid."""
 
     @classmethod
     def between(cls, lower: Points, upper: Points) -> "Region":
@@ -50,22 +49,23 @@ class Region:
 
     @classmethod
     def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
-        """Return a cylinder along an axis of space, with the centre of its base (d,) [m]."""
+        """Return a cylinder along a coordinate axis, with the centre of its base at ``base`` (d,) [m]."""
         across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
         lower, upper = base - radius * across, base + radius * across
         upper[axis] += height
         return cls(lower, upper, base, across, radius)
 
     def distance(self, points: Points) -> Points:
-        """Return distances, which beyond an edge or a corner are too small."""
+        """Return the distances of points from the boundary. Beyond an edge or a corner, the distance is
+        underestimated."""
         from_faces = np.full(len(points), -np.inf)
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # NumPy is slow with short rows
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Yield, for each side at a finite position, a function from points to distances from the side, positive
-        inside."""
+        """Yield a function for each finite side of the region. The function returns the distances of points from the
+        side, which are positive inside."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
                 if np.isfinite(at):
@@ -81,12 +81,11 @@ class Region:
         return np.asarray(boxed - inwards * across)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are at most ``tolerance`` [m] outside."""
+        """Test (n,) which points (n, d) [m] are inside, or at most ``tolerance`` [m] outside."""
         return np.asarray(self.distance(points) <= tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
-        """Return the fraction (n,) inside the region of the cell, a spacing [m] wide, around each point (n, d) [m];
-        cells at a cylinder's side are taken as aligned with the side."""
+        """Return the fraction of each point's cell inside the region (n,). A cell is ``spacing`` [m] wide."""
         half, found = 0.5 * spacing, np.ones(len(points))
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):
             width = np.minimum(x + half, upper) - np.maximum(x - half, lower)
@@ -94,7 +93,6 @@ class Region:
         return np.asarray(found * np.clip((self.radius - self._from_axis(points)) / spacing + 0.5, 0.0, 1.0))
 
     def _from_axis(self, points: Points) -> Points:
-        """Return distances from a cylinder's axis or a sphere's centre; 0 for other regions."""
         squares = np.zeros(len(points))
         for x, base, is_across in zip(points.T, self.base, self.across, strict=True):
             if is_across:
@@ -102,8 +100,8 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which particles crossed a wall, but no rim, between ``before`` (n, d) [m] and ``after`` (n, d)
-        [m]."""
+        """Test (n,) which particles crossed a wall between the positions ``before`` and ``after`` (n, d) [m]. Particles
+        may cross the rim."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
@@ -113,7 +111,7 @@ class Region:
         return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
-        """Return the region without sides along periodic axes; ``periods`` (d,) [m] are 0 along other axes."""
+        """Return the region without sides along periodic axes. ``periods`` (d,) [m] is 0 along non-periodic axes."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
 
@@ -123,17 +121,17 @@ def _from_plane(points: Points, axis: int, at: float, inwards: float) -> Points:
 
 
 ALONG = 1e-3
-"""Angle [rad] below which images in two directions are not distinguished."""
+"""Least angle between the directions of two distinct periodic images [rad]."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """One period of a scene; positions may leave it, and particles interact with all images."""
+    """The periodic box of a scene. Positions may leave the box, and particles interact with all periodic images."""
 
     lower: tuple[float, ...]
-    """(d,) [m]; 0 without period"""
+    """Lower corner of the periodic box (d,) [m]. It is 0 along axes without a period."""
     lengths: tuple[float, ...]
-    """(d,) [m]; 0 without period"""
+    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
 
     @classmethod
     def of(cls, lower: Points, lengths: Points) -> Self:
@@ -141,7 +139,8 @@ class Domain:
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
     def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Return the lower ends [m], the lengths [m] and the inverse lengths [1/m], as Warp vectors."""
+        """Return the lower corner [m], the lengths [m] and the inverse lengths [1/m] of the periodic box as Warp
+        vectors."""
         rest = (0.0,) * (3 - len(self.lengths))
         frequency = (1.0 / length if length else 0.0 for length in self.lengths)
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
@@ -151,13 +150,12 @@ class Domain:
         return lower + wrapped(points - lower, np.array(self.lengths)) if any(self.lengths) else points
 
     def shortest(self, ways: Points) -> Points:
-        """Return the vectors (n, d) [m] to the nearest images of points."""
+        """Return the vectors to the nearest periodic images, given the vectors ``ways`` (n, d) [m] to any images."""
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
         """Return the images of points (n, d) [m] in a region between corners (d,) [m], and a mask (n,) of the points
-        with an image inside. Infinite ends become the ends of the period, and a region longer than the period the
-        period."""
+        with an image there. An infinite corner means the end of the periodic box."""
         start, lower, upper = self.ends(lower, upper)
         lengths = np.array(self.lengths)
         images = start + wrapped(points - start, lengths) if lengths.any() else points
@@ -165,7 +163,6 @@ class Domain:
         return images, np.all((images >= lower) & (images < upper), axis=1)
 
     def ends(self, lower: Points, upper: Points) -> tuple[Points, Points, Points]:
-        """Return the lower ends from which `within` counts images, and the corners of its region, each (d,) [m]."""
         begin, lengths = np.array(self.lower), np.array(self.lengths)
         start = np.where(np.isfinite(lower), lower, begin)
         end = np.where(np.isfinite(upper), upper, begin + lengths)
@@ -174,9 +171,12 @@ class Domain:
         return start, np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
-        """Return ``seen`` of the vectors from a place (d,) to all images of points (n, d) within ``reach`` [m]: arrays
-        (n, k), each for one image of every point. ``seen`` is a linear function of vectors (n, d), such as their
-        component across a direction. Images with equal ``seen`` count once, as the image inside the period."""
+        """Return the vectors from a place (d,) to all images of points (n, d) within ``reach`` [m], after applying
+        ``seen``. The list has one array (n, k) per image.
+
+        ``seen`` is a linear function of vectors (n, d), such as their component across a direction. Images with equal
+        results count once.
+        """
         steps, inverse, shifts = self.images(reach, seen)
         way = seen(self.wrapped(points) - place)
         if len(steps):
@@ -184,8 +184,8 @@ class Domain:
         return [way + shift for shift in shifts] if len(steps) else [way]
 
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
-        """Return the translations (m, k) [m] between images with different ``seen``, their inverse (k, m), and shifts
-        (i, k) [m] from the nearest image to all images within ``reach`` [m]."""
+        """Return the translations between distinct images (m, k) [m], their inverse (k, m), and the shifts to all
+        images within ``reach`` (i, k) [m]. Images are distinct if ``seen`` maps them to different points."""
         lengths = np.array(self.lengths)
         steps = _independent(seen(np.eye(len(lengths))), lengths) if lengths.any() else np.zeros((0, 0))
         if not len(steps):
@@ -200,8 +200,7 @@ WITHOUT_PERIODS = Domain((), ())
 
 
 def _independent(axes: Points, lengths: Points) -> Points:
-    """Return a maximal independent set of translations (m, k) between images, projected by ``axes`` (d, k), longest
-    first."""
+    """Return linearly independent translations between images (m, k), longest first."""
     left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
     for _ in lengths:
         sizes = np.linalg.norm(left, axis=1)
@@ -216,20 +215,20 @@ def _independent(axes: Points, lengths: Points) -> Points:
 
 @dataclass(frozen=True)
 class Room:
-    """A region without the solids in it, which repeat with every period."""
+    """A region without the solids in it. The solids repeat periodically."""
 
     region: Region
     solids: Sequence[Solid]
     periods: Points
-    """(d,) [m]; 0 along other axes"""
+    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
 
     @property
     def dimension(self) -> int:
         return len(self.periods)
 
     def from_solids(self, points: Points, reach: float = np.inf) -> Points:
-        """Return distances from the nearest solid, infinite without solids. Beyond ``reach`` [m] only their signs and
-        lower bounds are exact."""
+        """Return the distances of points from the nearest solid, or infinity without solids. Distances above ``reach``
+        [m] are only lower bounds."""
         if not self.solids:
             return np.full(len(points), np.inf)
         images = [points + shift for shift in self.shifts()]
@@ -250,5 +249,5 @@ class Room:
         return [solid, *(Placed(solid, shift, turn) for shift in self.shifts()[1:])]
 
     def shifts(self) -> list[Points]:
-        """Return the shifts (d,) to periodic images [m]; the first is 0."""
+        """Return the shifts to periodic images (d,) [m]. The first shift is 0."""
         return [np.array(shift) for shift in product(*((0.0, -a, a) if a else (0.0,) for a in self.periods))]

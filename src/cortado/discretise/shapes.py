@@ -1,5 +1,4 @@
-"""Arrays of points in float64: lattice blocks and discs, pairs of neighbours, also across periods, and their density.
-Kernels for these arrays run on the CPU, on which all scenes are discretised."""
+"""Arrays of points in float64: lattices in boxes and discs, pairs of neighbours, and the density of points."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -14,19 +13,18 @@ from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
 
 Points = NDArray[np.float64]
-"""(n, d)"""
+"""Array of points, usually (n, d)."""
 Which = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
 ROUND_OFF = 1e-6
-"""Fraction of a spacing by which a length may be shorter than its number of cells: 0.25 / 0.05 counts as 5."""
+"""Tolerated round-off of a length when its cells are counted [spacings]."""
 
 NEARBY = 4
-"""Largest difference, along an axis, between the numbers of points of a stretched lattice and of the rest lattice."""
 EXCESS = 0.003
-"""Largest relative difference between the volumes of a stretched lattice's cells and of the shape."""
+"""Greatest relative difference between the volume of a stretched lattice and the volume of its shape."""
 MOST_STRETCHED = 0.03
-"""Largest logarithm of the stretching along an axis, for a density right within 1 %, also beside walls."""
+"""Greatest logarithm of the stretching along an axis. It limits the error of the density to 1 %."""
 
 
 class Rows:
@@ -43,8 +41,8 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """Return bounds (n,) of where a condition on numbers (n,), true at ``low`` (n,) and false at ``high`` (n,), stops
-    being true."""
+    """Find the boundary of a condition by bisection. The condition is true at ``low`` (n,) and false at ``high`` (n,).
+    Return the two bounds (n,)."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -54,14 +52,14 @@ def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvin
 
 @dataclass(frozen=True)
 class Block:
-    """A lattice of points that fills a box: ``first + i spacings``, 0 <= i < counts."""
+    """A lattice of points that fills a box."""
 
     first: Points
-    """(d,) [m]"""
+    """First point (d,) [m]."""
     counts: Points
-    """(d,) integers as floats, which may be larger than any array."""
+    """Numbers of points along the axes (d,), as floats, because they may be larger than any array."""
     spacings: Points
-    """(d,) [m]"""
+    """Spacings along the axes (d,) [m]."""
 
     @cached_property
     def size(self) -> float:
@@ -75,23 +73,25 @@ class Block:
         return Block(self.first - cells * self.spacings, self.counts + 2 * cells, self.spacings)
 
     def points(self) -> Points:
-        """Return the points (n, d) [m]; the last axis varies fastest."""
+        """Return the points (n, d) [m]. The last axis varies fastest."""
         axes = zip(self.first, self.spacings, self.counts, strict=True)
         return grid([x + spacing * np.arange(int(n)) for x, spacing, n in axes])
 
 
 def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """Return the points ``lower + (i + 1/2) spacing`` whose cells are inside the box between corners (d,) [m]."""
+    """Return a lattice of the cells that fit inside the box between corners (d,) [m], starting at the lower corner."""
     first = np.asarray(lower, dtype=np.float64)
     counts = whole_cells(np.asarray(upper, dtype=np.float64) - first, spacing)
     return Block(first + 0.5 * spacing, counts, np.full(len(first), spacing))
 
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """Return points ``lower + (i + 1/2) spacing`` that fill a box between corners (d,) [m]. If a side is no integer
-    number of cells, the lattice is stretched along some axes and compressed along others, at most by `MOST_STRETCHED`.
-    The number of points matches the volume within `EXCESS`, rather from below, because compressed fluid bursts apart.
-    If no lattice does both, only cells inside have points."""
+    """Return a lattice of points that fills a box between corners (d,) [m].
+
+    If a side is not an integer number of cells, the lattice is stretched or compressed along the axes by at most
+    `MOST_STRETCHED`. The number of points then matches the volume within `EXCESS`. If no lattice fits so well, only the
+    cells inside the box have points.
+    """
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
@@ -110,7 +110,8 @@ def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 
 def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
-    """Return a lattice symmetric about a centre (d,) [m] that extends as far as half lengths (d,) [m] allow."""
+    """Return a lattice that is symmetric about a centre (d,) [m] and fits into a box with half side lengths
+    (d,) [m]."""
     counts = whole_cells(2.0 * np.asarray(half, dtype=np.float64), spacing)
     first = np.asarray(centre, dtype=np.float64) - 0.5 * (counts - 1.0) * spacing
     return Block(first, counts, np.full(len(first), spacing))
@@ -122,14 +123,15 @@ def lattice(counts: Points, spacing: float) -> Points:
 
 
 def disc(radius: float, spacing: float, dimension: int) -> Points:
-    """Return a symmetric lattice (n, dimension) [m] in a disc about the origin, or on a line: at least one point."""
+    """Return a lattice in a disc or on a line segment about the origin (n, dimension) [m]. It has at least one
+    point."""
     points = lattice(np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0)), spacing)
     return points[np.linalg.norm(points, axis=1) <= radius]
 
 
 def across(direction: ArrayLike) -> Points:
-    """Return unit vectors (d - 1, d) perpendicular to a unit vector (d,) and to one another, nearly along axes of
-    space."""
+    """Return perpendicular unit vectors (d - 1, d) that are also perpendicular to the unit vector
+    ``direction`` (d,)."""
     frame = [np.asarray(direction, dtype=np.float64)]
     for axis in np.argsort(np.abs(frame[0]), kind="stable")[:-1]:
         vector = np.eye(len(frame[0]))[axis]
@@ -139,20 +141,20 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """Return an origin (d,) [m] near the middle of points (n, d) [m] that are far from 0 relative to their extent,
-    otherwise 0. The origin is a multiple of a power of two, so that subtracting it causes no rounding."""
+    """Return an origin (d,) [m] near points (n, d) [m] that are far from 0, or 0. The origin is a multiple of a power
+    of two, so that subtracting it causes no rounding."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
 
 
 def whole_cells(lengths: Points, spacing: float) -> Points:
-    """Return the numbers of cells that fit into lengths [m], any shape."""
+    """Return the numbers of cells that fit into lengths [m]."""
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
 
 
 def grid(axes: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return all combinations (n, d) of the values of the axes; the last axis varies fastest."""
+    """Return all combinations of the values of the axes (n, d). The last axis varies fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
@@ -161,7 +163,6 @@ def in_space(vectors: Any) -> Any:
 
 
 def corners(lower: Points, upper: Points) -> Points:
-    """(2^d, d)"""
     return np.array(list(product(*zip(lower, upper, strict=True))), dtype=np.float64)
 
 
@@ -169,18 +170,18 @@ CHUNK = 8192
 
 Period = tuple[Points, Points]
 Pairs = tuple[Numbers, Numbers, Points]
-"""First and second point of each pair, and their distance [m]; each (m,)."""
+"""Arrays (m,) of the first point, the second point and the distance [m] of each pair."""
 
 
 def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 0.0, lengths: ArrayLike = 0.0) -> Pairs:
-    """Find all pairs of one of ``some`` and one of the ``others`` that are at most ``reach`` [m] apart.
+    """Find all pairs of points that are at most ``reach`` [m] apart, one from ``some`` and one from ``others``.
 
     Args:
-        some: (n, d) [m].
-        others: (m, d) [m].
-        reach: [m].
-        lower: (d,) start of the period [m].
-        lengths: (d,) lengths of the period [m], 0 for other axes; distances are to the nearest image.
+        some: points (n, d) [m].
+        others: points (m, d) [m].
+        reach: search radius [m].
+        lower: lower corner of the periodic box (d,) [m].
+        lengths: lengths of the periodic box (d,) [m], 0 along axes without a period.
     """
     from scipy.spatial import cKDTree
 
@@ -200,7 +201,8 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
 
 def apart(separations: Points, lengths: ArrayLike) -> Points:
-    """Return separations (m, d) [m] to the nearest image for periods ``lengths`` (d,) [m]."""
+    """Return separations (m, d) [m] to the nearest periodic image. ``lengths`` (d,) [m] are the lengths of the periodic
+    box."""
     lengths = np.asarray(lengths, dtype=np.float64)
     if not lengths.any():
         return separations
@@ -208,8 +210,8 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
 
 
 def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numbers:
-    """Return the indices of the ``others`` (m, d) [m] in the box around ``some`` (n, d) [m], extended by ``reach`` [m];
-    all indices if an axis is periodic, or if ``some`` is empty."""
+    """Return the indices of the points in ``others`` (m, d) [m] that may be within ``reach`` [m] of ``some`` (n, d)
+    [m]."""
     if lengths.any() or not len(some):
         return np.arange(len(others))
     beyond = reach * (1.0 + 1e-9)
@@ -218,7 +220,7 @@ def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numb
 
 
 def wrapped(positions: Points, lengths: Points) -> Points:
-    """Return positions (..., d) inside [0, length) on periodic axes, also after rounding."""
+    """Move positions (..., d) into the range [0, length) along periodic axes."""
     if not lengths.any():
         return positions
     safe = np.where(lengths > 0.0, lengths, 1.0)
@@ -227,15 +229,15 @@ def wrapped(positions: Points, lengths: Points) -> Points:
 
 
 MOST_AVERAGE_COMPRESSION = 0.1
-"""Largest mean of max(n - 1, 0) over the initial particles, where n is the relative number density."""
+"""Greatest mean compression of the initial particles. The compression is the excess of the relative number density over
+1, or 0."""
 MOST_DENSITY = 1.5
-"""Largest relative number density of an initial particle; particles half a spacing apart have 1.4."""
+"""Largest relative number density of an initial particle."""
 NOTED_COMPRESSION = 0.03
-"""Mean compression above which a warning is given; a lattice disturbed by a tenth of a spacing has 0.02."""
+"""Mean compression above which a warning is given."""
 NOTED_DENSITY = 0.5
-"""Relative number density below which the particles hardly form a fluid."""
+"""Relative number density below which particles are too far apart for a fluid."""
 AT_ONE_PLACE = 1e-3
-"""Distance of coincident particles [spacings]."""
 
 
 def check_crowding(
@@ -248,18 +250,18 @@ def check_crowding(
     period: Period,
     bodies: Sequence[str] | NDArray[np.str_] = (),
 ) -> str | None:
-    """Return a warning about particles that are crowded, or that hardly touch each other; None for others. Raise
-    `InputError` if they would burst apart, with both names if two bodies overlap.
+    """Return a warning if particles are crowded or too far apart, or None. Raises `InputError` if the particles would
+    burst apart. If two bodies of fluid overlap, the message names both.
 
     Args:
         what: the particles in words, in the plural.
         positions: (n, d) [m].
-        kernel: W.
-        support: radius [m].
-        volume: of a particle at rest [m^d].
-        spacing: [m].
-        period: as of `check_apart`.
-        bodies: (n,) the name of each particle's body.
+        kernel: smoothing kernel.
+        support: support radius [m].
+        volume: volume of a particle at rest [m^d].
+        spacing: particle spacing [m].
+        period: lower corner (d,) and lengths (d,) of the periodic box [m], 0 along axes without a period.
+        bodies: (n,) the name of each particle's body of fluid.
     """
     point, other, distances = pairs_within(positions, positions, support, *period)
     seen = volume * kernel.weight(distances, positions.shape[1], support)
@@ -291,7 +293,8 @@ def _compression(densities: NDArray[Any]) -> float:
 def _check_meeting(
     bodies: NDArray[np.str_], positions: Points, point: Numbers, other: Numbers, seen: NDArray[Any]
 ) -> None:
-    """Raise `InputError` if only particles of other bodies crowd particles; ``seen`` (k,) is a pair's density."""
+    """Raise `InputError` if two bodies of fluid overlap. ``seen`` (k,) is the density contribution of each pair of
+    particles."""
     foreign = bodies[point] != bodies[other]
     together = np.bincount(point, seen)
     added = np.bincount(point, seen * foreign)
@@ -310,8 +313,7 @@ def _check_meeting(
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
-    """Raise `InputError`, which begins with ``what``, if two particles (n, d) [m] coincide. The period starts at a
-    corner (d,) and has lengths (d,) [m], 0 along other axes."""
+    """Raise `InputError` if two particles (n, d) [m] coincide. The error message begins with ``what``."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
     if pairs.size:
@@ -324,7 +326,7 @@ def check_apart(what: str, positions: Points, spacing: float, period: Period) ->
 
 
 def nearest(positions: Points) -> NDArray:
-    """Return the distance (n,) [m] of each of at least two particles (n, d) [m] to its nearest neighbour."""
+    """Return the distance from each particle (n, d) [m] to its nearest neighbour (n,) [m]."""
     from scipy.spatial import cKDTree
 
     return cKDTree(positions).query(positions, k=2)[0][:, 1]
@@ -340,8 +342,8 @@ def _in_bands() -> Any:
 
 
 def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments: Any) -> None:
-    """Launch a kernel with arguments by name, which writes to NumPy arrays: on all cores if ``in_bands``, as no two
-    threads write to one element, otherwise on one core."""
+    """Launch a kernel that writes to NumPy arrays. If ``in_bands`` is true, all cores are used, and no two threads may
+    write to the same element."""
     from cortado.device.launching import launch
     from cortado.device.threads import WARP
 
@@ -355,7 +357,8 @@ def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments:
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """Return a Warp array that shares a NumPy array's memory; with more than one axis, the last becomes vectors."""
+    """Return a Warp array that shares the memory of a NumPy array. If there are several axes, the last one becomes
+    vectors."""
     import warp as wp
 
     types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i), "bool": (wp.bool, None)}

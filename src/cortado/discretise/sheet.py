@@ -1,4 +1,5 @@
-"""Sheets, walls without thickness, in float64, with their wall particles: edges in 2-D, triangles in 3-D."""
+"""Sheets, which are walls without thickness, and their wall particles, in float64. A sheet consists of edges in 2-D and
+of triangles in 3-D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +17,12 @@ from cortado.discretise.walls import Places, RestLattice, WallLayers, wall_weigh
 
 @dataclass(frozen=True, eq=False)
 class Sheet(Solid):
-    """A surface with fluid on both sides. Distances from it are never negative, as it has no inside."""
+    """A surface with fluid on both sides. Distances from a sheet are never negative."""
 
     vertices: Points
-    """(m, d) [m]"""
+    """Vertices (m, d) [m]."""
     corners: Numbers
-    """(k, d) indices of the vertices of each edge or triangle."""
+    """Indices of the vertices of each edge or triangle (k, d)."""
 
     @classmethod
     def along(cls, places: Points) -> "Sheet":
@@ -32,12 +33,12 @@ class Sheet(Solid):
 
     @property
     def pieces(self) -> Points:
-        """(k, d, d) [m]"""
+        """Return the corners of the edges or triangles (k, d, d) [m]."""
         return self.vertices[self.corners]
 
     @property
     def normals(self) -> Points:
-        """(k, d) unit vectors"""
+        """Return the unit normals of the edges or triangles (k, d)."""
         return np.asarray(self._across / np.linalg.norm(self._across, axis=1, keepdims=True))
 
     def centroid(self) -> Points:
@@ -51,7 +52,7 @@ class Sheet(Solid):
         return cls(np.concatenate([one.vertices for one in sheets]), np.concatenate(corners))
 
     def placed(self, position: Points, turn: Points) -> "Sheet":
-        """Return the sheet rotated by a matrix (d, d) and then shifted by (d,) [m]."""
+        """Return the sheet rotated by the matrix ``turn`` (d, d) and then shifted by ``position`` (d,) [m]."""
         return Sheet(self.vertices @ turn.T + position, self.corners)
 
     def extent(self) -> tuple[Points, Points]:
@@ -66,8 +67,8 @@ class Sheet(Solid):
         return nearest_on_edges(points, self.pieces)
 
     def aside(self, points: Points, distance: float) -> Points:
-        """Return points (n, d) [m] at a distance [m] from the sheet, on the same side as given points (n, d) [m]; for
-        points on the sheet, on the side of the normals."""
+        """Move points (n, d) [m] to a distance [m] from the sheet, without changing their side of the sheet. Points on
+        the sheet move along its normals."""
         feet = self.nearest(points)
         away = points - feet
         length = np.linalg.norm(away, axis=1)
@@ -82,7 +83,7 @@ class Sheet(Solid):
         return Faces(self.vertices, np.concatenate([self.corners, self.corners[:, ::-1]]))
 
     def crossed(self, starts: Points, ends: Points, spacing: float) -> Which:
-        """Test (n,) which segments between points (n, d) [m] cross the sheet, for particles with a spacing [m]."""
+        """Test (n,) which line segments from ``starts`` (n, d) to ``ends`` (n, d) [m] cross the sheet."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -100,7 +101,8 @@ class Sheet(Solid):
 
     @cached_property
     def _across(self) -> Points:
-        """Return normal vectors (k, d) with a size proportional to the length or area of each edge or triangle."""
+        """Return the normals of the edges or triangles (k, d), proportional in length to the size of the edge or
+        triangle."""
         first, *others = np.moveaxis(self.pieces, 1, 0)
         along = [other - first for other in others]
         return along[0][:, ::-1] * np.array([-1.0, 1.0]) if len(along) == 1 else np.cross(*along)
@@ -112,11 +114,11 @@ class Sheet(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Thickened(Solid):
-    """Points within a depth of a sheet, as a solid."""
+    """A solid of all points within a distance of a sheet."""
 
     sheet: Sheet
     depth: float
-    """[m]"""
+    """Greatest distance from the sheet [m]."""
 
     def extent(self) -> tuple[Points, Points]:
         lower, upper = self.sheet.extent()
@@ -132,7 +134,7 @@ class Thickened(Solid):
         return np.asarray(feet + self.depth * away / np.maximum(length, 1e-300))
 
     def faces(self, fine: float) -> Faces:
-        """Return a surface with sharp edges: the sheet shifted to both sides, and strips between the ends."""
+        """Return the surface with sharp edges: the sheet shifted to both sides, and strips along the boundary."""
         sheet, count = self.sheet, len(self.sheet.vertices)
         aside = np.zeros_like(sheet.vertices)
         for corner in sheet.corners.T:
@@ -155,7 +157,8 @@ class Thickened(Solid):
 
 
 def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> WallPoints:
-    """Build the wall particles on both sides of a sheet and around its ends, in the layers of a flat wall."""
+    """Build the wall particles of a sheet, on both sides and around its ends. Their depths are the depths of a flat
+    wall's layers."""
     apart = DENSITY * lattice.spacing
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
     positions = np.concatenate([one.points for one in parts])
@@ -167,9 +170,12 @@ def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> Wall
 def sheet_weights(
     sheet: Sheet, points: Sequence[Points], flat: Sequence[Points], room: Room, lattice: RestLattice, least: float
 ) -> Points:
-    """Compute the weights (b,) of a sheet's wall particles, fitted at points at least ``least`` [m] from any surface.
-    The lists have positions (b, d) [m] and flat-wall weights (b,), first of the sheet, then of other walls in the
-    room."""
+    """Compute the weights of a sheet's wall particles (b,). They are fitted at points at least ``least`` [m] from any
+    surface.
+
+    ``points`` and ``flat`` list the positions (b, d) [m] and the flat-wall weights (b,) of wall particles. The first
+    entry belongs to the sheet, and the remaining entries belong to further walls in the room.
+    """
     spacing, own = lattice.spacing, len(points[0])
     heights = spacing * (np.arange(int(np.ceil(lattice.support / spacing - 0.5))) + 0.5)
     found = np.concatenate([surface_points(Thickened(sheet, height), spacing, 0.0).points for height in heights])

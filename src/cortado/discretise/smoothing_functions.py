@@ -2,8 +2,9 @@
 
     W = sigma w(q),    grad W = (sigma / h) f(q) s,    H u = (sigma / h^2) (f(q) u + (f'(q) / q) (s . u) s),
 
-with q = r / h, s = x / h and f(q) = w'(q) / q. GPUs have an instruction only for the reciprocal root, so q is q^2 (1 /
-q), and products with 1 / q replace divisions. Without branches, two functions of a pair share terms.
+with the kernel W, its Hessian H, the normalisation sigma, the separation x, the distance r, the support radius h and
+any vector u. The ratios are q = r / h, s = x / h and f(q) = w'(q) / q. The functions avoid divisions, which are slow on
+GPUs.
 """
 
 from functools import cache
@@ -17,7 +18,7 @@ from cortado.device.precision import Precision, arithmetic
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C2, WENDLAND_C4, SmoothingKernel
 
 Radial = tuple[Any, Any, Any]
-"""Warp functions w(q), f(q, 1 / q) = w' / q for the gradient, and f' / q of the same arguments for the Hessian."""
+"""Warp functions of a smoothing kernel: its value, and the radial factors of its gradient and its Hessian."""
 
 
 def _cubic_spline(precision: Precision) -> Radial:
@@ -95,11 +96,16 @@ RADIAL_FUNCTIONS = {
 
 @cache
 def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SimpleNamespace:
-    """Build Warp functions of a separation x [m]: ``weight`` (W), ``slope`` (a of grad W = a x), ``slope_change`` (the
-    derivative of a along a vector u, with which H u = a u + (grad a . u) x), ``slope_gradient`` (grad a) and
-    ``gradient``.
+    """Build Warp functions of a separation x [m], the inverse support radius [1/m] and the normalisation of the kernel
+    [1 / m^d]:
 
-    Arguments are x, 1 / h [1/m] and the normalisation sigma [1 / m^d]. A tape can differentiate ``taped`` functions.
+    - ``weight`` returns the kernel.
+    - ``slope`` returns the factor a in the kernel's gradient a x.
+    - ``slope_change`` returns the derivative of a along a vector u.
+    - ``slope_gradient`` returns the gradient of a.
+    - ``gradient`` returns the gradient of the kernel.
+
+    A tape can differentiate the functions if ``taped`` is true.
     """
     real, vector = precision.real, precision.vector
     value, gradient_factor, hessian_factor = RADIAL_FUNCTIONS[kernel.name](precision)
@@ -109,7 +115,8 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
 
     @wp.func
     def square(x: vector, per_h: real) -> real:
-        """Return q^2. For coincident particles, tiny keeps 1 / q finite, so that H = W''(0) I."""
+        """Return the squared distance relative to the support radius. A tiny number is added, which keeps its
+        reciprocal finite."""
         return wp.dot(x, x) * (per_h * per_h) + tiny
 
     @wp.func

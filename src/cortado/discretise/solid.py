@@ -1,4 +1,4 @@
-"""Solids with faces and moments, in float64. Points are (n, d) [m]; distances (n,) [m] are negative inside."""
+"""Solids with faces and moments, in float64. Points are (n, d) [m]. Distances (n,) [m] are negative inside."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from cortado.discretise.shapes import Numbers, Points, whole_origin
 
 @dataclass(frozen=True)
 class Faces:
-    """A closed surface of flat faces: edges in 2-D, with the inside on their left; triangles in 3-D."""
+    """A closed surface of flat faces: edges in 2-D, and triangles in 3-D. Edges have the inside on their left."""
 
     vertices: Points
-    """(m, d) [m]"""
+    """Vertices (m, d) [m]."""
     corners: Numbers
-    """(k, d) indices of the vertices of each face, in 3-D counterclockwise as seen from outside."""
+    """Indices of the vertices of each face (k, d), in 3-D counterclockwise as seen from outside."""
 
     def moved(self, turn: Points, position: Points) -> "Faces":
         return Faces(self.vertices @ turn.T + position, self.corners)
@@ -27,7 +27,7 @@ class Faces:
 
 
 def nearest_on_edges(points: Points, edges: Points) -> Points:
-    """Return the nearest points (n, 2) of edges (k, 2, 2) to points (n, 2) [m]."""
+    """Return the nearest points on edges (k, 2, 2) to given points (n, 2) [m]."""
     best, found = np.full(len(points), np.inf), np.zeros_like(points)
     for first, last in edges:
         side = last - first
@@ -42,16 +42,16 @@ def nearest_on_edges(points: Points, edges: Points) -> Points:
 @dataclass(frozen=True)
 class Moments:
     volume: float
-    """[m^d]"""
+    """Volume [m^d]."""
     centre: Points
-    """(d,) centroid [m]"""
+    """Centroid (d,) [m]."""
     second: Points
-    """(d, d) integrals of products of coordinates about the centroid [m^(d + 2)]."""
+    """Integrals of products of coordinates, relative to the centroid (d, d) [m^(d + 2)]."""
 
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
-    """Return the moments of a body enclosed by edges (k, 2, 2) or triangles (k, 3, 3) [m] by surface integrals (Mirtich
-    1996). Faces are counterclockwise as seen from outside, with weights (k,)."""
+    """Return the moments of a body enclosed by edges (k, 2, 2) or triangles (k, 3, 3) [m], by surface integrals
+    (Mirtich 1996). Each face has a weight (k,). Faces are counterclockwise as seen from outside."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
     about = corners - origin
@@ -68,7 +68,7 @@ class Solid(ABC):
 
     @property
     def is_bounded(self) -> bool:
-        """Return False for an unbounded solid, which extends beyond its box."""
+        """Return False for a solid that extends beyond its box."""
         return True
 
     @abstractmethod
@@ -81,31 +81,31 @@ class Solid(ABC):
 
     @abstractmethod
     def nearest(self, points: Points) -> Points:
-        """Return the nearest points of the surface to given points."""
+        """Return the nearest points on the surface."""
 
     @abstractmethod
     def faces(self, fine: float) -> Faces:
-        """Return the surface as flat faces, about ``fine`` [m] wide on curved parts."""
+        """Return flat faces of the surface, about ``fine`` [m] wide on curved parts."""
 
     def moments(self) -> Moments:
-        """Return volume, centroid and second moments, to round-off, for solids that may move freely."""
+        """Return the volume, the centroid and the second moments of the solid."""
         raise NotImplementedError(f"{type(self).__name__} has no moments")
 
     def shown_faces(self, fine: float) -> Faces:
-        """Return the `faces` for pictures, for an unbounded solid only inside its box."""
+        """Return the faces for pictures. An unbounded solid is shown only inside its box."""
         return self.faces(fine)
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
-        """Return distances up to ``reach`` [m], beyond which only signs and lower bounds are exact."""
+        """Return the distances of points from the surface. Distances above ``reach`` [m] are only lower bounds."""
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Return points of the surface, one for each area fine^(d - 1) [m^(d - 1)], and outward unit vectors (n, d);
-        None if a lattice around the solid finds such points as fast."""
+        """Return evenly spread points on the surface (n, d) [m], about ``fine`` [m] apart, and the outward unit vectors
+        (n, d). Returns None if the points must be found from a lattice around the solid."""
         return None
 
     def outward(self, points: Points) -> Points:
-        """Return unit vectors (n, d) away from the solid at points off its surface."""
+        """Return outward unit vectors (n, d) at points away from the surface."""
         across = (points - self.nearest(points)) * np.sign(self.distance(points))[:, None]
         return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300))
 
@@ -116,9 +116,9 @@ class Placed(Solid):
 
     solid: Solid
     position: Points
-    """(d,) [m]"""
+    """Shift (d,) [m]."""
     turn: Points
-    """(d, d) rotation matrix"""
+    """Rotation matrix (d, d)."""
 
     @property
     def is_bounded(self) -> bool:
@@ -154,7 +154,7 @@ class Placed(Solid):
 
 @dataclass(frozen=True)
 class Hollow(Solid):
-    """All of space except a shape: a tank with infinitely thick walls."""
+    """All of space except a shape, as a tank with infinitely thick walls."""
 
     cavity: Solid
 
@@ -185,9 +185,9 @@ class Hollow(Solid):
 @dataclass(frozen=True)
 class Mass:
     volume: float
-    """[m^d]"""
+    """Volume [m^d]."""
     inertia: Points
-    """(3, 3) about the centroid [m^(d + 2)]; in 2-D only the entry about z is not 0."""
+    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only the entry about z is not 0."""
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":
@@ -198,5 +198,5 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
-        """Return volume and inertia divided by ``unit`` [m^d]."""
+        """Return the volume and the inertia divided by ``unit`` [m^d]."""
         return Mass(self.volume / unit, self.inertia / unit)

@@ -1,5 +1,5 @@
-"""Wall particles of solids, and points beside solids where fluid may rest, in float64. Both are evenly spaced, at a
-depth below a solid's surface or at a height above it."""
+"""Wall particles of solids, and points beside solids where fluid may rest, in float64. The points are evenly spaced, at
+a fixed depth below the surface or at a fixed height above the surface."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,44 +16,38 @@ from cortado.discretise.solid import Solid
 from cortado.discretise.walls import Places, RestLattice, WallLayers
 
 Near = Callable[[Points, float], Which]
-"""A test of which points (n, d) [m] are closer than a length [m] to an object."""
+"""A function that tests which points (n, d) [m] are closer than a length [m] to an object."""
 FINE = {2: 12, 3: 3}
-"""Number of candidate points of a surface per spacing, among which wall particles are chosen, by the number of
-dimensions. With 3 in the plane, wall particles of discs push first rows of fluid unevenly by 9 % (12: 3 %)."""
+"""Number of candidate points on a surface per spacing, by dimension."""
 CELLS = (3, 4)
-"""Number of parts, along each axis, into which cells near a surface are divided until they are fine; the last number is
-even."""
+"""Numbers of parts along each axis of a cell near a surface. The last number must be even."""
 APART, LEAST_APART = 0.78, 0.65
-"""In spacings: a point is chosen if no other is closer than the first number; then points are moved, to no closer than
-the second."""
+"""Least distance between chosen points, and least distance after the points are moved [spacings]."""
 FIRST, GROWTH = 0.05, 1.7
-"""Fraction of the points that is processed first, and the factor by which each later portion grows."""
+"""Fraction of the points in the first portion, and growth factor of later portions."""
 ROUNDS = {2: 40, 3: 4}
-"""Rounds in which each point moves to the centroid of its nearest candidates, by the number of dimensions."""
+"""Number of rounds of Lloyd's algorithm, by dimension."""
 OFF_FACES = (0.31, 0.17, 0.23)
-"""Shift of fine lattices in cells, so that their points do not lie on the faces of aligned solids."""
+"""Shift of fine lattices [cells], which keeps lattice points away from faces."""
 HALVINGS = 20
 MANY, MOST = 50_000, 2_000_000
-"""Numbers of points. Above the first, several cores search for the nearest faces; with fewer points they mostly wait
-for each other. At most the second number is searched at a time, to limit the memory."""
+"""Least number of points for a search on several cores, and greatest number of points in one search."""
 SEED = 1
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points of a surface, each with the area that it represents."""
+    """Points on a surface, with the area of each point."""
 
     points: Points
-    """(n, d) [m]"""
+    """Points (n, d) [m]."""
     shares: Points
-    """(n,) area, relative to that of a lattice point, spacing^(d - 1)"""
+    """Areas of the points (n,), relative to the area of a lattice point."""
 
 
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
-    """Return points about a spacing [m] apart, ``depth`` [m] below the surface of a solid, or above it if negative.
-
-    Where a solid is thinner than twice the depth, the points are in the middle.
-    """
+    """Return points about a spacing [m] apart, ``depth`` [m] below the surface of a solid. With a negative depth the
+    points are above the surface. In thin parts of the solid the points are in the middle."""
     fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
     points = feet - _reached(solid, feet, away, depth)[:, None] * away
@@ -63,10 +57,10 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
-    """Choose points about a spacing [m] apart from candidates (n, d) [m], which are ``fine`` [m] apart on a surface.
+    """Choose points about a spacing [m] apart from candidates on a surface (n, d) [m], which are ``fine`` [m] apart.
 
-    First, as many points as possible are chosen so that no two are too close. Each then moves to the centroid of the
-    candidates nearest to it (Lloyd 1982), and on to a candidate. Points too close to another are removed, and gaps
+    First, as many points as possible are chosen at a least distance. Each point then moves to the candidate nearest to
+    the centroid of its closest candidates (Lloyd 1982). Finally, points that are too close are removed and gaps are
     filled.
     """
     dimension = candidates.shape[1]
@@ -89,8 +83,8 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
-    """Return points of a surface (n, d) [m], about ``fine`` [m] apart and representing equal areas, with unit vectors
-    (n, d) away from the solid. If a lattice is used to find them, only points that pass ``is_near`` are returned."""
+    """Return points on the surface of a solid (n, d) [m], about ``fine`` [m] apart, and the outward unit vectors (n,
+    d). Points that fail the test ``is_near`` may be left out."""
     found = solid.own_feet(fine)
     if found is not None:
         return found
@@ -117,8 +111,8 @@ def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tupl
 
 
 def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
-    """Return depths (n,) below feet (n, d) [m], at most a given depth [m], up to which the foot is the nearest point of
-    the surface."""
+    """Return the depths (n,) [m] below surface points (n, d) [m] down to which the surface point is the nearest one.
+    They are at most ``depth`` [m]."""
     if depth <= 0.0:
         return np.full(len(feet), depth)
     found, tolerance = np.full(len(feet), depth), 1e-3 * depth
@@ -132,8 +126,9 @@ def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
 
 
 def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
-    """Yield points (n, d) of a lattice, ``fine`` [m] apart, in portions. They include all points within ``reach`` [m]
-    of an object inside a box between two corners. Cells of the box are divided while their centres pass ``is_near``."""
+    """Yield the lattice points (n, d) near an object in a box, in portions. All points within ``reach`` [m] of the
+    object are included. ``fine`` is the spacing of the lattice [m], and ``is_near`` tests which points are near the
+    object."""
     dimension, size = len(lower), int(np.prod(CELLS)) * fine
     cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
     *coarse, last = CELLS
@@ -152,16 +147,14 @@ def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_ne
 
 
 def _divided(cells: Points, size: float, parts: int) -> Points:
-    """Divide cells of a size [m] with centres (m, d) [m] into ``parts`` along each axis; return new centres (n, d)
-    [m]."""
     along = size / parts * (np.arange(parts) + 0.5) - 0.5 * size
     inside = np.array(list(product(along, repeat=cells.shape[1])))
     return (cells[:, None] + inside).reshape(-1, cells.shape[1])
 
 
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
-    """Return indices of points (n, d) [m]: those already chosen, and those in an ``order`` that are further than
-    ``apart`` [m] from all points chosen before."""
+    """Choose more points, in the given ``order``, that are further than ``apart`` [m] from all ``chosen`` points.
+    Return the indices of all chosen points."""
     size = int(FIRST * len(order)) + 1
     while len(order):
         some, order, size = order[:size], order[size:], int(GROWTH * size) + 1
@@ -173,8 +166,8 @@ def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Nu
 
 
 def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
-    """Return distances (n,) from points (n, d) [m] to the nearest of other points (m, d) [m], infinite beyond a reach
-    [m], and the indices (n,) of the nearest."""
+    """Return the distances (n,) from ``some`` points (n, d) [m] to the nearest of ``points`` (m, d) [m], and the
+    indices of the nearest points (n,). Distances beyond ``reach`` [m] are infinite."""
     from scipy.spatial import cKDTree
 
     workers = usable_cores() if len(points) > MANY else 1
@@ -183,8 +176,8 @@ def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Point
 
 
 def _first_of_all_near(points: Points, apart: float) -> Which:
-    """Test (n,) which points (n, d) [m] stay if each, in order, stays unless a point within ``apart`` [m] has
-    stayed."""
+    """Test (n,) which points (n, d) [m] remain if points within ``apart`` [m] of an earlier remaining point are
+    removed."""
     from scipy.spatial import cKDTree
 
     first, second = cKDTree(points).query_pairs(apart, output_type="ndarray").T
@@ -202,20 +195,19 @@ def _first_of_all_near(points: Points, apart: float) -> Which:
 
 @dataclass(frozen=True)
 class WallPoints(Rows):
-    """Wall particles whose weights are still to be computed."""
+    """Wall particles without their final weights."""
 
     positions: Points
-    """(b, d) [m]"""
+    """Positions (b, d) [m]."""
     flat: Points
-    """(b,) weights that they would have in the density in a flat wall [-]"""
+    """Weights of the particles in the density next to a flat wall (b,) [-]."""
     feet: Points
-    """(b, d) vector from each to the nearest point of its surface [m]"""
+    """Vectors from the particles to the nearest points on the surface (b, d) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContainerWalls:
-    """The wall particles of a container without solids. Those far enough from all solids keep their positions and their
-    cells: fluid beside a solid does not interact with them."""
+    """The wall particles of a container without solids. Wall particles far from all solids keep their positions."""
 
     points: WallPoints
     solids: Sequence[Solid]
@@ -223,13 +215,11 @@ class ContainerWalls:
     room: Room
     """Room for fluid, outside of solids at rest."""
     spacing: float
-    """Particle spacing [m]."""
     support: float
-    """Support radius [m]."""
 
     @property
     def _clear(self) -> float:
-        """Return the least distance from solids at which the feet of wall particles keep their positions [m]."""
+        """Return the least distance from solids at which wall particles keep their positions [m]."""
         return 2.0 * self.support + self.spacing
 
     @cached_property
@@ -239,8 +229,8 @@ class ContainerWalls:
         return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
 
     def keeps(self, points: Points) -> Which:
-        """Test (n,) which points (n, d) [m] below surfaces are in the cell of a wall particle that keeps its position,
-        or above the rim of the container."""
+        """Test (n,) which points (n, d) [m] are near a wall particle that keeps its position, or above the rim of the
+        container."""
         from scipy.spatial import cKDTree
 
         kept = np.asarray(self.room.from_solids(points, self.spacing) > 0.0)
@@ -250,44 +240,43 @@ class ContainerWalls:
         return kept
 
     def is_near(self, points: Points, furthest: float) -> Which:
-        """Test (n,) which points (n, d) [m] are closer than a length [m] to solids, or to the surface where wall
-        particles do not keep their positions. Some other points pass, too."""
+        """Test (n,) which points (n, d) [m] may be closer than ``furthest`` [m] to a solid or to moved wall
+        particles."""
         near = self._clear + 2.0 * self.spacing + furthest
         return np.asarray(self.room.from_solids(points, near) < near)
 
 
 DENSITY = 0.75
-"""In spacings: distance between wall particles."""
+"""Distance between wall particles [spacings]."""
 MARGIN = 0.01
-"""In spacings: a part of a surface that extends less than this into its room touches a wall or another solid."""
+"""Greatest distance of touching surfaces [spacings]."""
 TOLERANCE = 0.05
-"""In spacings: tolerance in the comparison of the depths of a point below two surfaces."""
+"""Tolerance in comparisons of depths below two surfaces [spacings]."""
 EDGE = 0.4
-"""In spacings: largest distance of edges from fine points of the surface."""
+"""Greatest distance from an edge to the nearest fine point of the surface [spacings]."""
 EXPOSED_HALVINGS, EXPOSED_ROUNDS, DIGITS = 12, 30, 4
 
 
 @dataclass(frozen=True)
 class ExposedSurface:
-    """Fine points of the surface that fluid in a room can touch: that of solids, which may touch each other, and of the
-    container near them."""
+    """Fine points on the surface that fluid can touch: the surface of solids, and of the container near solids."""
 
     feet: Points
-    """(n, d) [m]"""
+    """Points on the surface (n, d) [m]."""
     away: Points
-    """(n, d) unit vectors from the surface into the room"""
+    """Unit vectors from the surface into the room (n, d)."""
     owner: Numbers
-    """(n,) index into `solids` of each point's solid"""
+    """Index into `solids` for each point (n,)."""
     solids: Sequence[Solid]
-    """Solids that form the container's walls, then the other solids."""
+    """Solids that form the walls of the container, followed by the solids in the container."""
     container: ContainerWalls
     lower: Points
-    """(d,) Start of the period [m]"""
+    """Lower corner of the periodic box (d,) [m]."""
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """Find the surface of solids, and of the container near them, that fluid can touch, as points spacing / `FINE`
-        apart. Along periodic axes it extends a support beyond the period, which starts at ``lower`` (d,) [m]."""
+        """Find fine points on the surface that fluid can touch. Along periodic axes the surface extends one support
+        radius beyond the periodic box. ``lower`` (d,) [m] is the lower corner of the periodic box."""
         fine = container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
@@ -299,7 +288,6 @@ class ExposedSurface:
 
     @property
     def _fine(self) -> float:
-        """Return the spacing of fine points [m]."""
         return self.container.spacing / FINE[self.feet.shape[1]]
 
     @cached_property
@@ -309,9 +297,8 @@ class ExposedSurface:
         return cKDTree(self.feet)
 
     def walls(self, layers: WallLayers, lattice: RestLattice) -> WallPoints:
-        """Build wall particles in layers at the depths of a flat wall's layers. Each has the weight of a flat wall's
-        area equal to its part of the layer; at smaller depths the weight is reduced, so that the first row of fluid
-        sees the same. No depth exceeds the layer's, even if a foot is hidden where parts of a solid overlap."""
+        """Build wall particles at the depths of a flat wall's layers. The weight of a wall particle is proportional to
+        its area, and is reduced near the surface."""
         parts, spacing = [], lattice.spacing
         for depth, weight in zip(layers.depths, layers.weights, strict=True):
             found = self.beneath(depth)
@@ -324,12 +311,12 @@ class ExposedSurface:
         return WallPoints.joined(parts)
 
     def owners(self, walls: WallPoints) -> Numbers:
-        """Return the index (b,) into `solids` of each wall particle's solid."""
+        """Return the index into `solids` for each wall particle (b,)."""
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
     def beneath(self, depth: float) -> SurfacePoints:
-        """Return points about a spacing apart, ``depth`` [m] below the surface, or in the middle of thinner parts.
-        Points where the container keeps its wall particles are left out."""
+        """Return points about a spacing apart, ``depth`` [m] below the surface or in the middle of thinner parts.
+        Points near the container's kept wall particles are left out."""
         points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
         points = points[
             _within_a_period(points, self.lower, self.container.room.periods, 0.0) & ~self.container.keeps(points)
@@ -338,7 +325,6 @@ class ExposedSurface:
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
     def _at(self, depth: float) -> Points:
-        """Return fine points (n, d) [m] at a depth below the surface."""
         fine, found = self._fine, []
         if not len(self.feet):
             return self.feet
@@ -364,8 +350,8 @@ class ExposedSurface:
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
-        """Return the nearest points (n, d) [m] of the surface, on a solid or where two solids meet, to points (n, d)
-        [m] below it. ``nearest`` (n,) are the nearest fine points, at distances ``reach`` (n,) [m]."""
+        """Return the nearest points on the surface (n, d) [m] to points (n, d) [m] below the surface. ``nearest`` (n,)
+        is the index of the nearest fine point, and ``reach`` (n,) [m] is its distance."""
         fine = self._fine
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
@@ -384,8 +370,8 @@ class ExposedSurface:
         return found
 
     def _edges(self, feet: Points, owner: Numbers) -> Points:
-        """Return points (n, d) [m] near feet (n, d) [m] where the solid of each foot, ``owner`` (n,), meets the next
-        solid: the feet, moved onto one surface and the other in turn."""
+        """Return points (n, d) [m] on the edges where two solids meet, by alternating projection onto the two surfaces.
+        ``owner`` (n,) is the solid of each starting point in ``feet`` (n, d) [m]."""
         distances = np.abs([solid.distance(feet) for solid in self.solids])
         distances[owner, np.arange(len(feet))] = np.inf
         other, found = np.argmin(distances, axis=0), feet.copy()
@@ -398,41 +384,41 @@ class ExposedSurface:
         return np.where(near[:, None], found, feet)
 
     def _in_the_middle(self, depth: float) -> Points:
-        """Return points (n, d) [m] below those feet for which another part of the surface is closer than a depth [m]:
-        as deep as possible with the foot still the nearest point."""
+        """Return points (n, d) [m] in the middle of parts that are too thin for points at ``depth`` [m]."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
         ends = np.zeros(len(thin)), np.full(len(thin), depth)
         low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
         return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
 
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
-        """Test (n,) whether each foot is the nearest point of the surface to the point at a depth (n,) [m] below it."""
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]
         return np.asarray(distances > depths - TOLERANCE * self.container.spacing)
 
 
 def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
-    """Test (n,) which points (n, d) [m] are at most ``reach`` [m] outside of periods that start at ``lower``."""
+    """Test (n,) which points (n, d) [m] are inside the periodic box or at most ``reach`` [m] outside it. ``lower`` is
+    its lower corner."""
     within = (points >= lower - reach) & (points < lower + periods + reach)
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
 def _is_exposed(feet: Points, away: Points, container: ContainerWalls) -> Which:
-    """Test (n,) which points of surfaces (n, d) [m], with unit vectors (n, d) away from the solids, fluid can touch."""
+    """Test (n,) which surface points (n, d) [m] fluid can touch. ``away`` (n, d) has the outward unit vectors of the
+    solids."""
     spacing = container.spacing
     return container.room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 
 
 def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
-    """Return points half a spacing, one and a half, ... up to ``reach`` [m] from a solid, where a lattice aligned with
-    the surface may rest."""
+    """Return points where a lattice of fluid may rest beside a solid, up to ``reach`` [m] from its surface. The first
+    points are half a spacing from the surface, and further points follow at each spacing."""
     heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
     points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
     return Places(points, frames(solid.outward(points)))
 
 
 def frames(normals: Points) -> Points:
-    """Return axes (n, d, d), one unit vector in each row; the first ones are the given unit vectors (n, d)."""
+    """Return orthonormal axes (n, d, d). The first axis is the given unit vector (n, d)."""
     if normals.shape[1] == 2:
         return np.stack([normals, normals[:, ::-1] * np.array([-1.0, 1.0])], axis=1)
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]

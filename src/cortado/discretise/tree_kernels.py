@@ -1,11 +1,11 @@
-"""Queries on surfaces, in float64: the nearest point of a tree of triangles, the winding number of a surface around a
-point, and which segments cross a sheet.
+"""Queries on surfaces, in float64: the nearest point on triangles, winding numbers, and crossings of line segments with
+sheets.
 
-Nodes are numbered as in a heap: the children of node n are 2 n and 2 n + 1. Nodes from ``leaves`` on are leaves; the
-first leaf contains triangles ``starts[0]`` to ``starts[1]``.
+The children of node n are the nodes 2 n and 2 n + 1. Nodes with numbers from ``leaves`` on are leaves. The first leaf
+contains the triangles from ``starts[0]`` up to ``starts[1]``.
 
-A sheet is an open surface of faces: edges in 2-D, triangles in 3-D. Faces extend slightly beyond their edges, so that a
-segment through a joint of two faces crosses the sheet.
+A sheet is an open surface of faces, which are edges in 2-D and triangles in 3-D. Faces extend slightly beyond their
+edges, so that no line segment passes between two faces.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ def square_from_box(p: vector, b: box) -> real:
 
 @wp.func
 def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
-    """Return the nearest point of a triangle (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
+    """Return the nearest point on a triangle (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
     zero = real(0.0)
     ab = b - a
     ac = c - a
@@ -70,7 +70,8 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
-    """Find the nearest point of the triangles, and its squared distance, up to ``reach``; else the point itself."""
+    """Find the nearest points on the triangles and the squared distances. If no triangle is within ``reach``, the
+    result is the given point."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach
@@ -116,8 +117,8 @@ def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach:
 
 @wp.func
 def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
-    """Return 1 if an edge rising along the second axis is ahead of a point along the first axis, -1 if a falling edge
-    is, otherwise 0. Despite rounding, both triangles of an edge get the same value up to the sign."""
+    """Return 1 if a rising edge is ahead of a point along the first axis, -1 for a falling edge, and 0 for no edge. The
+    result is consistent between the two triangles at an edge."""
     upwards = int(1)
     low = a
     high = b
@@ -134,7 +135,8 @@ def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
 
 @wp.func
 def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
-    """Return 1 if a ray along the last axis leaves through a triangle, -1 if it enters, otherwise 0."""
+    """Return 1 if a ray along the last axis leaves the solid through a triangle, -1 if the ray enters, and 0 if it
+    misses."""
     around = side_of_edge(p, a, b) + side_of_edge(p, b, c) + side_of_edge(p, c, a)
     if around == 0 or p[2] > wp.max(a[2], wp.max(b[2], c[2])):
         return int(0)
@@ -148,7 +150,7 @@ def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_windings(first: int, points, boxes, starts, corners, leaves: int, windings):
-    """Compute winding numbers of closed surfaces about points: 1 inside a surface with outward normals, 0 outside."""
+    """Compute the winding numbers of closed surfaces around points. Inside a surface with outward normals it is 1."""
     i = first + wp.tid()
     p = points[i]
     total = int(0)
@@ -172,7 +174,8 @@ def find_windings(first: int, points, boxes, starts, corners, leaves: int, windi
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """Test whether a segment passes through the interior of a triangle, by more than ``tolerance`` on both sides."""
+    """Test whether a line segment passes through the interior of a triangle. Both ends must be further than
+    ``tolerance`` from the triangle's plane."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -198,7 +201,8 @@ def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
 def some_edge_pierces(
     corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
 ) -> wp.bool:
-    """Test whether an edge of triangle s, without a vertex of triangle t, passes through t."""
+    """Test whether an edge of triangle s passes through triangle t. Edges that share a vertex with triangle t do not
+    count."""
     found = wp.bool(False)
     for k in range(3):
         following = (k + 1) % 3
@@ -214,8 +218,8 @@ def some_edge_pierces(
 def find_crossings(
     first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
-    """Find the later triangles that cross a given one, and write them to ``others`` from ``places`` on while there is
-    room. Triangles have ``names`` of vertices; ``points`` are unused."""
+    """Find the triangles with a higher number that cross each triangle. Their numbers are written to ``others``,
+    beginning at the index in ``places``, while there is room."""
     i = first + wp.tid()
     low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
     high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))
@@ -247,9 +251,9 @@ def find_crossings(
 
 
 MARGIN = {"float64": 1e-6, "float32": 1e-3}
-"""Widening of faces, more than the round-off 1,000 spacings from the origin [spacings]."""
+"""Widening of faces [spacings], which exceeds round-off up to 1,000 spacings from the origin."""
 AROUND = 1e-3
-"""Distance around a segment within which faces are searched, in float32 [spacings]."""
+"""Margin of the search for faces around a line segment, in float32 [spacings]."""
 
 
 @cache
@@ -258,17 +262,16 @@ def faces_type(precision: Precision) -> Any:
 
     class Faces:
         trees: wp.array(dtype=wp.uint64)
-        """Trees of the boxes around the faces, one for each sheet."""
+        """Bounding volume hierarchies of the faces, one for each sheet."""
         starts: wp.array(dtype=wp.int32)
         """Index of the first face of each sheet."""
         middles: wp.array(dtype=vector)
-        """Centre of each sheet, the origin of its faces [m]."""
+        """Centre of each sheet [m], which is the origin of its faces."""
         normals: wp.array(dtype=vector)
-        """(faces,) unit vectors"""
         places: wp.array2d(dtype=vector)
-        """(faces, 3) a point on each end or side of a face [m]."""
+        """A point on each boundary of a face (faces, 3) [m]."""
         inwards: wp.array2d(dtype=vector)
-        """(faces, 3) unit vectors from these points into the face; in 2-D the third is 0."""
+        """Unit vectors from each boundary into the face (faces, 3). In 2-D the third vector is 0."""
         margin: real
         around: real
 
@@ -278,9 +281,9 @@ def faces_type(precision: Precision) -> Any:
 
 @cache
 def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Build Warp functions for points relative to the centre of sheet k. ``query`` searches faces in the box around two
-    points, extended by a distance; ``meets`` tests whether a segment crosses a face; ``goes_through`` tests whether it
-    crosses any face of the sheet."""
+    """Build Warp functions for points relative to the centre of a sheet. ``query`` finds the faces in a box around two
+    points. ``meets`` tests whether a line segment crosses a given face. ``goes_through`` tests whether a line segment
+    crosses any face."""
     real, vector, faces_of = precision.real, precision.vector, faces_type(precision)
 
     @wp.func
@@ -317,8 +320,8 @@ def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 
 def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision: Precision, device: Any) -> Any:
-    """Return the struct of the faces of sheets, from corners (k, d, d) [m] and unit normals (k, d), for particles with
-    a spacing [m]. Also return its trees, which the caller must keep alive."""
+    """Return the struct of the faces of sheets, from their corners (k, d, d) [m] and unit normals (k, d). Also return
+    the search trees of the struct, which the caller must keep alive."""
     made, trees, middles, rows = faces_type(precision)(), [], [], []
     for corners, normals in sheets:
         middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))

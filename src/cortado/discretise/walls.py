@@ -1,4 +1,4 @@
-"""Walls of boxes and cups, layer by layer, and the weights of wall particles in the density, in float64."""
+"""The layers of wall particles of boxes and cups, and the weights of wall particles in the density, in float64."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,16 +16,15 @@ if TYPE_CHECKING:
 
 
 def nearest_cells(length: float, spacing: float) -> int:
-    """Return the number of cells, at least 1, that best fills a length [m]."""
+    """Return the number of cells that best fills a length [m], at least 1."""
     return max(int(np.floor(length / spacing + 0.5)), 1)
 
 
 def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
-    """Return one layer (n, d) around a box, ``depth`` [m] outside: faces, edges and corners, each point once.
+    """Return one layer of points (n, d) around a box, ``depth`` [m] outside. Periodic axes have no wall.
 
-    Along a face the points continue the lattice inside, slightly stretched if a side is no multiple of the spacing.
-    Periodic axes have no wall. Points are built axis by axis: outside along this axis, inside along earlier axes,
-    either along later ones.
+    The points continue the lattice inside the box. The lattice is slightly stretched if a side is not a multiple of the
+    spacing.
     """
     inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
     outside = [
@@ -37,11 +36,11 @@ def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: f
 
 
 def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
-    """Return one layer (n, 3) of the walls of an upright cup, with the centre of its base at the origin and its height
-    along the third axis.
+    """Return one layer of wall particles (n, 3) around an upright cup. The centre of the cup's base is at the origin,
+    and its height is along the third axis.
 
-    The side consists of rings ``depth`` outside of the radius, about a spacing apart. Base and lid (if any) have the
-    lattice of fluid in the cup, ``depth`` outside, and a ring that continues the side.
+    The side consists of rings, ``depth`` [m] outside and about a spacing apart. The base and the lid continue the
+    lattice of the fluid, with an additional ring at the side.
     """
     side = ring(radius + depth, spacing)
     end = np.concatenate([disc(radius, spacing, 2), side])
@@ -51,14 +50,13 @@ def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: fl
 
 
 def ring(radius: float, spacing: float) -> Points:
-    """Return points (n, 2) on a circle, about a spacing apart."""
+    """Return points on a circle (n, 2), about a spacing apart."""
     count = max(nearest_cells(2.0 * np.pi * radius, spacing), 3)
     angles = 2.0 * np.pi * np.arange(count) / count
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
 def _cells(lower: float, upper: float, count: int) -> Points:
-    """Return the centres (count,) of equal cells between two ends."""
     return lower + (upper - lower) * (np.arange(count) + 0.5) / count
 
 
@@ -67,17 +65,17 @@ def stacked(flat: Points, levels: Points) -> Points:
 
 
 OVERLAP = 0.8
-"""Largest distance of upright lattices from the side of a cup, as a fraction of the reach."""
+"""Greatest distance of upright lattices from the side of a cup, relative to ``reach``."""
 
 
 @dataclass(frozen=True)
 class Places(Rows):
-    """Points beside walls for fluid at rest, each with the axes of its lattice."""
+    """Points beside walls where fluid may rest, with the axes of each point's lattice."""
 
     points: Points
-    """(n, d) [m]"""
+    """Points (n, d) [m]."""
     axes: Points
-    """(n, d, d) one unit vector in each row"""
+    """Axes of the lattices (n, d, d), as unit vectors."""
 
     @classmethod
     def upright(cls, points: Points) -> "Places":
@@ -86,8 +84,8 @@ class Places(Rows):
 
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
-    """Return places less than ``reach`` [m] from a wall of a box, starting half a spacing from the wall. Places are
-    built axis by axis: near a wall along this axis, far from walls along earlier axes, anywhere along later ones."""
+    """Return the places less than ``reach`` [m] from a wall of a box. The first places are half a spacing from the
+    wall."""
     every = [_between(a, b, open_axis, spacing) for a, b, open_axis in zip(lower, upper, periodic, strict=True)]
     beside = [
         np.zeros(len(x), dtype=bool) if open_axis else np.minimum(x - a, b - x) < reach
@@ -99,11 +97,11 @@ def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: 
 
 
 def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: float) -> Places:
-    """Return places less than ``reach`` [m] from a wall of an upright cup, with the centre of its base at the origin
-    and its height along the third axis.
+    """Return the places less than ``reach`` [m] from a wall of an upright cup. The centre of the cup's base is at the
+    origin, and its height is along the third axis.
 
-    At the side, lattices are aligned with the side; on the base and the lid, further inside, they are lattices of fluid
-    in the cup. The top of an open cup, which may overflow, has no places.
+    Near the side of the cup, lattices are aligned with the side. On the base and the lid, they are lattices of the
+    fluid in the cup. The top of an open cup has no places.
     """
     levels = _between(0.0, height, False, spacing)
     closed = levels if lid else levels[levels < height - reach]
@@ -120,7 +118,8 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
 
 
 def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
-    """Return coordinates along an axis: a spacing apart from each wall on, or evenly spaced along a period."""
+    """Return coordinates along an axis, a spacing apart from each wall inwards. Along a periodic axis the coordinates
+    are evenly spaced."""
     count = nearest_cells(upper - lower, spacing)
     cells = np.arange(count, dtype=np.float64) + 0.5
     if periodic:
@@ -129,18 +128,19 @@ def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Poin
 
 
 ENDS = 6.0
-"""Distance from an edge beyond which weights of wall particles are constant, to a relative 1e-6 [supports]."""
+"""Distance from an edge above which the weights of wall particles are constant [support radii]."""
 WHOLE = 1e-9
-"""Tolerance within which a side is an integer number of cells [cells]."""
 
 
 def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
-    """Shorten a box between corners (d,) [m], without changing the weights of its wall particles, which repeat far from
-    edges and corners. Cells of a spacing [m] are removed from the middle of long sides that are an integer number of
-    cells. Return the upper corner (d,) [m], and a function from points (n, d) [m] on the walls of the long box to those
-    of the short one."""
+    """Shorten a box between corners (d,) [m], by removing cells from the middle of its long sides. The weights of wall
+    particles do not change, because they repeat far from edges.
+
+    Return the upper corner of the short box (d,) [m], and a function that maps points on the walls (n, d) [m] to the
+    short box.
+    """
     ends, lengths = int(np.ceil(ENDS * support / spacing)), upper - lower
     cells = np.array([nearest_cells(length, spacing) for length in lengths])
     whole = np.abs(lengths / spacing - cells) < WHOLE * cells
@@ -157,67 +157,67 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer [spacings], which exists if the fluid's second lattice layer reaches the wall. With half a
-spacing the deep layer would lie at the kernel's edge."""
+"""Depth of the shallow layer of wall particles [spacings]. It exists if the second layer of fluid reaches the wall."""
 
 
 @dataclass(frozen=True)
 class RestLattice:
     kernel: SmoothingKernel
     spacing: float
-    """[m]"""
+    """Particle spacing [m]."""
     support: float
-    """[m]"""
+    """Support radius [m]."""
     dimension: int
 
     @cached_property
     def offsets(self) -> Points:
-        """(m, d) [m]"""
+        """Return the separations of a lattice point from the lattice points within the support radius (m, d) [m]."""
         return lattice_offsets(self.spacing, self.support, self.dimension)
 
     def weights(self, separations: Points) -> Points:
-        """Return W (m,) [1 / m^d] at separations (m, d) [m]."""
+        """Return the smoothing kernel (m,) [1 / m^d] at separations (m, d) [m]."""
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """Return W, and the gradient of W times the spacing, (m, 1 + d) [-], relative to the sum of W on the
-        lattice."""
+        """Return the smoothing kernel and its gradient times the spacing (m, 1 + d) [-], relative to the kernel's sum
+        over the lattice."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
 
     def _to_plane(self, distance: float) -> Points:
-        """Return separations (m, d) [m] from the points of a lattice plane at a distance [m], along the first axis."""
         flat = np.unique(self.offsets[:, 1:], axis=0)
         return np.hstack([np.full((len(flat), 1), distance), flat])
 
     def plane_weight(self, distance: float) -> float:
-        """Return the sum of W [1 / m^d] over a lattice plane at a distance [m]."""
+        """Return the sum of the smoothing kernel over a lattice plane at a distance [m] [1 / m^d]."""
         return float(self.weights(self._to_plane(distance)).sum())
 
     def plane_slope(self, distance: float) -> float:
-        """Return the derivative of `plane_weight` [1 / m^(d + 1)]."""
+        """Return the derivative of `plane_weight` with respect to the distance [1 / m^(d + 1)]."""
         return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
 
 
 @dataclass(frozen=True)
 class WallLayers:
-    """Layers of wall particles behind a flat wall, the deepest last."""
+    """Layers of wall particles behind a flat wall, from the shallowest to the deepest."""
 
     depths: tuple[float, ...]
-    """Distances behind the surface of the container [m]."""
+    """Distances of the layers behind the surface [m]."""
     weights: tuple[float, ...]
-    """Weight in the density of a particle of each layer, relative to a fluid particle."""
+    """Weight in the density of a wall particle in each layer, relative to a fluid particle."""
 
 
 def wall_layers(lattice: RestLattice) -> WallLayers:
-    """Find the layers that meet these conditions at a flat wall, for fluid on a lattice that starts at half a spacing:
+    """Find the layers of wall particles at a flat wall. The first layer of fluid is half a spacing from the wall. The
+    layers meet two conditions:
 
-    - the fluid has the rest density (Band et al. 2018 scale volumes for that), in its first layer and in its second;
-    - a uniform pressure pushes no particle of the first layer. The contribution of a wall to the density of a particle
-      is steep enough to balance the pressure of the particle and of all its neighbours.
+    - The first and second layer of fluid have the rest density. Band et al. (2018) scale volumes for this purpose.
+    - A uniform pressure pushes no particle of the first layer. The wall's density contribution is steep enough to
+      balance the pressures of the particle and its neighbours.
 
-    One layer is enough if the second layer of fluid does not reach the wall: with supports of up to two spacings.
+    One layer is enough if the second layer of fluid does not reach the wall, as with support radii of up to two
+    spacings.
     """
     spacing, support, weight, slope = lattice.spacing, lattice.support, lattice.plane_weight, lattice.plane_slope
     below = spacing * np.arange(1, int(support / spacing) + 2)  # the lattice planes that the first layer misses
@@ -231,7 +231,6 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
         return np.array([SHALLOW * spacing, deepest] if two else [deepest])
 
     def weights(deepest: float) -> np.ndarray:
-        """Return weights that give the rest density to as many first layers of the fluid as the wall has layers."""
         layers = depths(deepest)
         seen = [[weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
         return np.linalg.solve(np.array(seen), missing[: len(layers)])
@@ -247,26 +246,26 @@ def wall_layers(lattice: RestLattice) -> WallLayers:
 
 
 STIFFNESS = 3e-3
-"""Penalty on relative changes of weights, compared with errors of the density, towards a flat wall's weights."""
+"""Penalty on relative deviations from a flat wall's weights, relative to density errors."""
 UNEVEN_STIFFNESS = 0.06
-"""Penalty as `STIFFNESS` for particles off a lattice; with 0.003 some would have no weight, and fluid would leak."""
+"""Penalty like `STIFFNESS`, for particles that are not on a lattice. A smaller penalty would let fluid leak."""
 LEAST, ROUNDS = 0.6, 4
-"""Smallest weight of particles off a lattice, relative to a flat wall's, and rounds that impose it."""
+"""Least weight of particles that are not on a lattice, relative to a flat wall, and number of rounds to impose it."""
 BALANCE = 0.02
-"""Weight of the push of a uniform pressure, compared with an error of the density. Without it the slopes of two layers
-around a cup become so shallow that fluid leaks; with 0.1 corners are too dense."""
+"""Weight of the force from a uniform pressure, relative to density errors. Smaller weights let fluid leak, and larger
+weights make corners too dense."""
 RAISED = 3.0
-"""Distance along the first axis of a place, away from a solid, over which free room is measured [spacings]."""
+"""Height above a solid where free room is measured [spacings]."""
 CHUNK = 4096
 
 
 Crossed = Callable[[Points, Points], Which]
-"""Test of which segments between points (n, d) [m] cross a sheet."""
+"""A function that tests which line segments between two arrays of points (n, d) [m] cross a sheet."""
 
 
 def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed | None) -> Points:
-    """Return, for each of n places, the part (n, 1 + d) of the `RestLattice.sums` from lattice points outside of the
-    room or behind a sheet. Points near the boundary count by the fraction of their cell that is outside."""
+    """Return the sums at each place over lattice points outside the room or behind a sheet (n, 1 + d), as in
+    `RestLattice.sums`. Points near the boundary are weighted with the outside fraction of their cell."""
     offsets = lattice.offsets
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
@@ -294,11 +293,10 @@ def wall_weights(
     known: int = 0,
     crossed: Crossed | None = None,
 ) -> Points:
-    """Compute the weights (b,) of wall particles in the density [-], relative to a fluid particle.
+    """Compute the weights of wall particles in the density (b,) [-], relative to a fluid particle.
 
-    With these weights the lattice has the rest density at all places, and a uniform pressure pushes no particle less
-    than a spacing from a wall, both by least squares. To balance the push, as in `wall_layers`, the wall contributes
-    twice the gradient of the missing fluid.
+    The weights are fitted by least squares to two conditions. The lattice has the rest density at all places. A uniform
+    pressure pushes no particle less than a spacing from a wall, as in `wall_layers`.
 
     Args:
         walls: (b, d) wall particles [m].
@@ -306,11 +304,10 @@ def wall_weights(
         places: places where fluid may rest.
         lattice: the lattice of the fluid at rest.
         room: the room for fluid.
-        lower: (d,) start of the period [m].
-        are_even: True for particles on lattices, whose weights are at least 0; others have the weight `LEAST` or more.
-        known: number of wall particles, the last ones, with known weights.
-        crossed: the test for the sheet to which the wall particles belong, except the known ones. Fluid interacts with
-            them only through the sheet.
+        lower: (d,) lower corner of the periodic box [m].
+        are_even: True for wall particles on lattices, with weights of at least 0. False for minimum weights of `LEAST`.
+        known: number of wall particles with known weights, which come last.
+        crossed: the test for crossing a sheet. Fluid interacts with the sheet's wall particles only through the sheet.
     """
     from scipy.sparse import coo_array, vstack
 
@@ -320,8 +317,8 @@ def wall_weights(
     is_sheet[:sought] = crossed is not None
 
     def demands(places: Places) -> tuple["csr_array", Points]:
-        """Return a matrix (m, b) of sums over wall particles at places, as functions of weights relative to flat walls,
-        and the sums (m,) that fluid at rest needs there."""
+        """Return the matrix (m, b) of sums over wall particles at places, and the sums (m,) that fluid at rest needs.
+        The matrix multiplies weights relative to flat walls."""
         place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
         if crossed is not None:
             seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
@@ -345,8 +342,8 @@ def wall_weights(
 
 
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Return the relative changes (b,) of flat-wall weights with which a matrix (m, b) gives the wanted product (m,),
-    for wall particles on lattices; weights are at least 0."""
+    """Return the relative changes (b,) of flat-wall weights for wall particles on lattices. The product of the matrix
+    ``sums`` (m, b) and the changes is ``wanted`` (m,). Weights are at least 0."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 
@@ -357,7 +354,8 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Return changes as `even_changes`, for evenly spaced particles off a lattice; weights are at least `LEAST`."""
+    """Return the relative changes (b,) of flat-wall weights for wall particles that are not on a lattice, like
+    `even_changes`. Weights are at least `LEAST`."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)

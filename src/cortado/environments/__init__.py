@@ -1,4 +1,4 @@
-"""Gymnasium environments that simulate fluids: see `docs/environments.md`.
+"""Gymnasium environments that simulate fluids. `docs/environments.md` describes them.
 
 Importing this package registers the environments for ``gymnasium.make("cortado/Carry-v0")`` and ``gymnasium.make_vec``.
 """
@@ -16,8 +16,8 @@ __all__ = ["EnvState", "FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 
 
 def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
-    """Make ``num_envs`` environments of a task, such as "Carry", in one launch, as `gymnasium.make_vec` does;
-    ``settings`` are arguments of `FluidVectorEnv`."""
+    """Make ``num_envs`` environments of a task, such as "Carry". All environments are simulated together. ``settings``
+    are arguments of `FluidVectorEnv`."""
     return FluidVectorEnv(task, num_envs, **settings)
 
 

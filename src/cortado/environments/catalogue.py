@@ -21,12 +21,12 @@ LED = {"motion": "path", "velocity": [0.0, 0.0], "colour": [0.6, 0.6, 0.65]}
 
 
 def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[str, Any]:
-    """Return the scene table of a box with corners ``lower`` and ``upper`` [m], and further keys."""
     return {"shape": "box", "lower": lower, "upper": upper, **others}
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return the actuators of a solid that moves along x and turns about z: greatest velocities [m/s], [rad/s]."""
+    """Return the actuators of a solid that moves along x and turns about z. The greatest velocities are ``fastest``
+    [m/s] and ``turning`` [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
     return (
@@ -36,7 +36,8 @@ def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Act
 
 
 class Vessels(Task):
-    """A base class of tasks with cups and jugs: in 2-D cross-sections, in 3-D round, with axes in the plane z = 0."""
+    """A base class of tasks with cups and jugs. In 2-D the vessels are cross-sections. In 3-D they are round, with axes
+    in the plane z = 0."""
 
     view: ClassVar[dict[str, Any]] = {}
 
@@ -44,29 +45,34 @@ class Vessels(Task):
         return [x, y, 0.0][: self.dimension]
 
     def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Return the corners of a box [m], given in the plane; in 3-D with a square base centred at z = 0."""
+        """Return the corners of a box [m], given its cross-section. In 3-D the box has a square base centred
+        at z = 0."""
         half = 0.5 * (upper[0] - lower[0])
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the scene table of fluid with this cross-section [m]: a box, in 3-D a cylinder."""
+        """Return the scene table of a fluid with the given cross-section [m]. The fluid is a box in 2-D and a cylinder
+        in 3-D."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
         return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
 
     def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
-        """Return the scene table of a container; none in 3-D, where spilt fluid falls without end."""
+        """Return the scene table of a container in 2-D. In 3-D the table is empty, and spilt fluid falls
+        without end."""
         return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
 
 
 class Carry(Vessels):
-    """The task of carrying a cup of water to a place, without spilling.
+    """The task of carrying a cup of water to a place without spilling.
 
-    Actions: the cup's velocity along x and its angular velocity. Goal: the place of the cup's middle. The reward is
-    minus the cup's distance to its goal [m], minus 10 times the fraction of water outside the cup. Task and reward
-    follow TransportWater of SoftGym (Lin et al. 2020). SoftGym counts particles; here they count smoothly
-    (`cortado.environments.terms.Share`), and the cup can lean.
+    The actions are the cup's velocity along x and its angular velocity. The goal is the target position of the cup's
+    centre. The reward is minus the cup's distance from the goal [m], minus 10 times the fraction of water outside the
+    cup.
+
+    Task and reward follow TransportWater of SoftGym (Lin et al. 2020). In contrast to SoftGym, the fraction is a smooth
+    function of particle positions (`cortado.environments.terms.Share`), and the cup can lean.
     """
 
     name = "Carry"
@@ -75,7 +81,7 @@ class Carry(Vessels):
     lowest = -12.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the cup [m]",)
     width, depth, height, wall = 0.15, 0.1, 0.175, 0.05
-    """Inner width of the cup, depth of its water, inner height of the cup, and thickness of its walls [m]."""
+    """Inner width of the cup, depth of the water, inner height of the cup, and thickness of the walls [m]."""
     floor = -0.15
     fastest, turning = 0.6, 1.0
     """Greatest velocity [m/s] and angular velocity [rad/s]."""
@@ -104,10 +110,10 @@ class Carry(Vessels):
 
 
 class CarryInSpace(Carry):
-    """The task of carrying a round cup of water along a line to a place, without spilling.
+    """The task of carrying a round cup of water along a line to a place without spilling.
 
-    Actions, goal and reward are those of `Carry`. The cup leans about the horizontal axis across its path, and is
-    lower.
+    Actions, goal and reward are the same as for `Carry`. The cup is lower, and leans about a horizontal axis
+    perpendicular to its path.
     """
 
     name = "CarryInSpace"
@@ -118,12 +124,13 @@ class CarryInSpace(Carry):
 
 
 class Latte(Task):
-    """The task of pouring milk from a moving nozzle into coffee, so that it lands as if the nozzle followed a hidden
-    path.
+    """The task of pouring milk from a moving nozzle into coffee. The milk should land as if the nozzle followed a
+    hidden path.
 
-    Actions: the positions along x to which the nozzle is sent. The reward is minus the mean squared distance between
-    the poured milk and its places with the hidden path, divided by the squared radius of the cup. The task follows
-    LatteArt of FluidLab (Xian et al. 2023); its reward differs by a factor and a constant.
+    The actions are target positions of the nozzle along x. The reward is minus the mean squared distance of the poured
+    milk from its positions in a run with the hidden path, divided by the squared radius of the cup.
+
+    The task follows LatteArt of FluidLab (Xian et al. 2023). Its reward differs by a factor and a constant.
     """
 
     name = "Latte"
@@ -131,11 +138,11 @@ class Latte(Task):
     coarse_spacing, coarse_step = 0.0025, 0.0014
     lowest = -4.0
     radius, depth, opening, column = 0.03, 0.015, 0.0025, 0.0625
-    """Radius of the cup, depth of its coffee, half-width of the nozzle, and height of the milk in the nozzle [m]."""
+    """Radius of the cup, depth of the coffee, half-width of the nozzle, and height of the milk in the nozzle [m]."""
     height = depth + 0.005
     """Height of the nozzle above the floor [m]."""
     reach, lag, pouring = 0.6 * radius, 0.03, 25
-    """Greatest position of the nozzle [m], time constant of its motion [s], and number of steps of pouring."""
+    """Greatest displacement of the nozzle [m], time constant of its motion [s], and number of pouring steps."""
     actuators = (Position("nozzle.path", (0.0, height), (0,), (reach,), lag=lag),)
 
     @property
@@ -158,15 +165,15 @@ class Latte(Task):
 
 
 def hidden_actions(task: Latte) -> NDArray:
-    """Return the actions (horizon, 1) of the hidden path: once around the outline of a heart, then to its middle."""
+    """Return the actions of the hidden path (horizon, 1). The path goes once around a heart and then to its middle."""
     angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
     return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
 
 
 @cache
 def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
-    """Return the positions (horizon, n, d) [m] of particles after each step with the hidden path, and weights (horizon,
-    n) [1/m2], which are 0 except for milk poured so far."""
+    """Return the particle positions after each step of the hidden path (horizon, n, d) [m], and the weights of the
+    poured milk (horizon, n) [1/m2]."""
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
@@ -181,11 +188,13 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
 
 
 class Pour(Vessels):
-    """The task of turning and moving a jug until its syrup is in a glass.
+    """The task of pouring syrup from a jug into a glass by moving and turning the jug.
 
-    Actions: the jug's velocity along x and its angular velocity, counterclockwise. The reward is the fraction of fluid
-    in the glass. Task and reward follow PourWater of SoftGym (Lin et al. 2020). SoftGym counts particles; here they
-    count smoothly (`cortado.environments.terms.Share`), and the jug stays at its height.
+    The actions are the jug's velocity along x and its angular velocity, counterclockwise. The reward is the fraction of
+    the fluid in the glass.
+
+    Task and reward follow PourWater of SoftGym (Lin et al. 2020). In contrast to SoftGym, the fraction is a smooth
+    function of particle positions (`cortado.environments.terms.Share`), and the jug stays at its height.
     """
 
     name = "Pour"
@@ -193,7 +202,7 @@ class Pour(Vessels):
     coarse_spacing, coarse_step = 0.0125, 0.00154
     lowest = 0.0
     lower, upper, wall = (0.25, -0.28), (0.45, -0.12), 0.05
-    """Corners of the inside of the glass, and the thickness of walls [m]."""
+    """Lower and upper corner of the inside of the glass, and thickness of the walls [m]."""
     fastest, turning = 0.1, 4.0
     """Greatest velocity [m/s] and angular velocity [rad/s]."""
     actuators = led("jug", fastest, turning, 2)
@@ -223,10 +232,10 @@ class Pour(Vessels):
 
 
 class PourInSpace(Pour):
-    """The task of pouring exactly a given fraction of a round jug's syrup into a round glass.
+    """The task of pouring a given fraction of syrup from a round jug into a round glass.
 
-    Actions are those of `Pour`. Goal: the fraction of the syrup to pour. The reward is minus the difference between the
-    fraction in the glass and the goal.
+    The actions are the same as for `Pour`. The goal is the fraction of the syrup to pour. The reward is minus the
+    absolute difference between the poured fraction and the goal.
     """
 
     name = "PourInSpace"
@@ -242,10 +251,11 @@ class PourInSpace(Pour):
 
 
 class Raft(Task):
-    """The task of moving a raft to a place, and keeping it level, with waves from a paddle.
+    """The task of moving a raft to a place with waves from a paddle, while the raft stays level.
 
-    Actions: the positions along x to which the paddle is sent. Goal: the place of the raft's middle. The reward is -(x
-    - x*)^2 / l^2 - 2 (1 - cos angle), with the goal x* and the length l of the raft.
+    The actions are target positions of the paddle along x. The goal is the target position of the raft's centre. The
+    reward is -(x - x*)^2 / l^2 - 2 (1 - cos angle), with the raft's position x, the goal x*, the raft's length l and
+    its angle.
     """
 
     name = "Raft"
@@ -278,11 +288,11 @@ class Raft(Task):
 
 
 class Splash(Task):
-    """The task of shaking a box in which a dam breaks, so that its water gets the shape of the letter L.
+    """The task of shaking a box of water after a dam break, so that the water takes the shape of the letter L.
 
-    Actions: the acceleration of the box along x and y, which acts on its water as a change of gravity. Goal: the left
-    side of the letter's stem. The reward is the fraction of the water inside the letter, whose particles count smoothly
-    (`cortado.environments.terms.Share`).
+    The actions are the acceleration of the box along x and y, which acts on the water as a change of gravity. The goal
+    is the left side of the letter's vertical bar. The reward is the fraction of the water inside the letter, as a
+    smooth function of particle positions (`cortado.environments.terms.Share`).
     """
 
     half = 0.3
@@ -292,7 +302,7 @@ class Splash(Task):
     lowest = 0.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the stem [m]",)
     gravity, strength, lag = 9.81, 12.0, 0.05
-    """Gravity and greatest acceleration of the box [m/s2], and time constant of this acceleration [s]."""
+    """Gravity and greatest acceleration of the box [m/s2], and time constant of the acceleration [s]."""
     actuators = (Position("gravity", (0.0, -gravity), (0, 1), (-strength, -strength), lag=lag),)
     goals = np.array([0.0]), np.array([1.5 * half])
 
@@ -311,10 +321,10 @@ class Splash(Task):
 
 @dataclass(frozen=True)
 class Letter:
-    """A function from goals to the two boxes of the letter L, whose total area is that of the water."""
+    """A function that maps goals to the two boxes of the letter L. The letter has the same area as the water."""
 
     half: float
-    """side of the square that the water fills at the start [m]"""
+    """Side length of the initial square of water [m]."""
 
     def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
         lower, upper = np.zeros((len(goal), 2, 2)), np.zeros((len(goal), 2, 2))
@@ -327,9 +337,11 @@ class Letter:
 class Stir(Task):
     """The task of stirring a cup of coffee until milk from one corner is spread everywhere.
 
-    Actions: the positions to which the spoon, a disc in the plane, is sent. The reward is the mean distance |dx| + |dy|
-    of pairs of milk particles, divided by that of pairs of all particles at the start, minus 1. The task follows Mixing
-    of FluidLab (Xian et al. 2023); its reward differs by a factor.
+    The actions are target positions of the spoon, which is a disc in the plane. The reward compares mean distances of
+    pairs of particles, where a distance is |dx| + |dy|. It is the mean distance of milk particles, divided by the
+    initial mean distance of all particles, minus 1.
+
+    The task follows Mixing of FluidLab (Xian et al. 2023). Its reward differs by a factor.
     """
 
     name = "Stir"
@@ -337,9 +349,9 @@ class Stir(Task):
     coarse_spacing, coarse_step = 0.005, 0.001
     lowest = -1.0
     width, depth, milky = 0.08, 0.045, 0.02
-    """Width of the cup, depth of the fluid, and size of the part whose left half is milk [m]."""
+    """Width of the cup, depth of the fluid, and size of the region with milk in its left half [m]."""
     spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
-    """Position of the spoon at the start, its radius, greatest displacement [m], and time constant of motion [s]."""
+    """Initial position of the spoon [m], radius [m], greatest displacement [m], and time constant of the motion [s]."""
     actuators = (Position("spoon.displacement", (0.0, 0.0), (0, 1), reach, lag=lag),)
 
     @property
@@ -370,8 +382,8 @@ TASKS: dict[str, type[Task]] = {
 
 
 def task_of(task: str | Task, size: str | None) -> Task:
-    """Return the task of a name and size ("small" by default), or a user's `Task`. Raise `InputError` for unknown names
-    and sizes, and for a size given together with a `Task`."""
+    """Return the task with a name and a size, by default "small", or a user-defined `Task`. Raises `InputError` for an
+    unknown name or size, or if a size is given together with a `Task`."""
     if isinstance(task, Task):
         if size is not None:
             raise InputError(f"size is {shown(size)}, but must be left out, as the task is a Task object.")

@@ -1,4 +1,4 @@
-"""Gymnasium environments: one, and a batch in one launch. `Twin` is an episode as a differentiable function."""
+"""Gymnasium environments of one scene and of a batch of scenes. `Twin` is an episode as a differentiable function."""
 
 import sys
 from collections.abc import Mapping
@@ -24,12 +24,12 @@ from cortado.scene.parameter_values import Arrays
 
 
 class Twin:
-    """Minus the sum of rewards of one episode, as a function of its actions (actions, a). Actions outside -1 to 1 are
-    clipped, as in the environment; their derivative is 0."""
+    """A differentiable function from the actions of an episode (actions, a) to minus the sum of its rewards. Actions
+    are clipped to the range from -1 to 1, as in the environment. Clipped actions have the derivative 0."""
 
     def __init__(self, scenes: Scenes, number: int = 0, actions: int | None = None, state: EnvState | None = None):
-        """Copy the current episode of scene ``number``, from the episode's start or from a saved ``state``.
-        ``actions``: number of actions, by default all that remain."""
+        """Copy the current episode of scene ``number``, from its beginning or from a saved ``state``. ``actions`` is
+        the number of actions, by default all remaining actions."""
         task, m = scenes.task, scenes.task.substeps
         require_at_most("number", whole_number("number", number, 0), len(scenes) - 1)
         done, begun, restart = 0, [one.at_rest(1) for one in task.actuators], None
@@ -46,37 +46,36 @@ class Twin:
             one.parameter: one.over(count, m, task.time_step, now)
             for one, now in zip(task.actuators, begun, strict=True)
         }
-        """Maps from the actions of each actuator to the parameter it drives."""
+        """Maps from each actuator's actions to its parameter."""
         goal = start.goal[None]
         loss = Frames({k * m: MinusReward(scenes.reward, goal, done + k) for k in range(1, count + 1)})
         self.problem = Problem(scenes.single, count * m, loss, state=restart)
         """The loss as a function of the scene's parameters."""
         fixed: Any = FixedParameters(self.problem, self._start) if self._start else self.problem
         self.search = Transformed(fixed, self.coordinates)
-        """The loss as a function of actions, by the names of `named`; pass it to `cortado.optimise`."""
+        """The loss as a function of the actions for `cortado.optimise`, by parameter name."""
         self.shape = count, sum(len(one.axes) for one in task.actuators)
-        """Shape (actions, a) of the actions."""
+        """Shape of the actions, (actions, a)."""
 
     def named(self, actions: Any) -> Arrays:
-        """Split actions into arrays by the name of the driven parameter."""
+        """Split actions into arrays by parameter name."""
         parts = split(self._actuators, checked_actions("actions", actions, self.shape))
         return {one.parameter: u for one, u in zip(self._actuators, parts, strict=True)}
 
     def value(self, actions: Any) -> float:
-        """Return minus the sum of rewards for these actions."""
+        """Return minus the sum of the rewards."""
         return self.search.value(self.named(actions))
 
     def value_and_gradient(
         self, actions: Any, gradient: GradientEstimator | None = None
     ) -> tuple[float, NDArray[np.float64]]:
-        """Return the loss and its derivative (actions, a) by an estimator, by default `gradients.Exact`."""
+        """Return the loss and its gradient (actions, a). The default estimator is `gradients.Exact`."""
         value, found = self.search.value_and_gradient(self.named(actions), gradient)
         bar = np.concatenate([found[one.parameter] for one in self._actuators], axis=1)
         return value, np.where(np.abs(actions) <= 1.0, bar, 0.0)
 
     def in_jax(self, gradient: GradientEstimator | None = None) -> Any:
-        """Return the loss as a function of a JAX array (actions, a) that JAX can differentiate: see
-        `cortado.jax.value`."""
+        """Return the loss as a differentiable function of a JAX array (actions, a). See `cortado.jax.value`."""
         from cortado.jax import value
         from cortado.optimisation.layers.with_jax import jnp
 
@@ -84,15 +83,13 @@ class Twin:
         return lambda actions: loss(jnp.asarray(actions))
 
     def in_torch(self, gradient: GradientEstimator | None = None) -> Any:
-        """Return the loss as a function of a PyTorch tensor (actions, a): see `cortado.torch.value`."""
+        """Return the loss as a differentiable function of a PyTorch tensor (actions, a). See `cortado.torch.value`."""
         from cortado.optimisation.layers.with_torch import torch
         from cortado.torch import value
 
         return self._of_actions(value(self.problem, gradient), lambda a, u: u.new_tensor(a), torch.tensordot)
 
     def _of_actions(self, loss: Any, like: Any, tensordot: Any) -> Any:
-        """Return a ``loss`` as a function of actions, by ``tensordot`` of a library; ``like`` makes its arrays."""
-
         def of_actions(actions: Any) -> Any:
             shape = getattr(actions, "shape", None)
             if shape is None or tuple(shape) != self.shape:
@@ -123,8 +120,8 @@ Info = dict[str, Any]
 
 
 class FluidEnv(gymnasium.Env[Observation, NDArray]):
-    """A Gymnasium environment of one scene; ``gymnasium.make("cortado/Carry-v0")`` makes one. See
-    `docs/environments.md`."""
+    """A Gymnasium environment of one scene, made by ``gymnasium.make("cortado/Carry-v0")``. `docs/environments.md`
+    describes it."""
 
     metadata = METADATA
 
@@ -138,10 +135,17 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         sensors: Mapping[str, Sensor] | None = None,
         render_mode: str | None = None,
     ):
-        """Make the environment of a ``task``: a name, such as "Carry", or your own `Task`. ``size``: "small" (the
-        default) or "large". ``particles``: number of observed particles. ``sensors``, by name, are observed too; see
-        `cortado.sensors`. ``device`` and ``precision`` are as in `Simulation`; ``render_mode`` is None or
-        "rgb_array"."""
+        """Make the environment of a task.
+
+        Args:
+            task: a name, such as "Carry", or a user-defined `Task`.
+            size: "small", the default, or "large".
+            device: "cpu", or "cuda:0" for the first GPU, as in `Simulation`.
+            precision: "float32" or "float64".
+            particles: number of observed particles.
+            sensors: additional sensors to observe, by name; see `cortado.sensors`.
+            render_mode: None or "rgb_array".
+        """
         settings = size, device, precision, particles, sensors, render_mode
         self._envs = FluidVectorEnv(task, 1, *settings, AutoresetMode.DISABLED)
         self.scenes, self.render_mode = self._envs.scenes, self._envs.render_mode
@@ -150,12 +154,13 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Slices of an observation by the name of its parts."""
+        """Slices of an observation by the names of its parts."""
         return self.scenes.layout
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
-        """Begin an episode; equal seeds give equal bits. ``options={"state": state}`` goes back to a saved state, as
-        `restore` does, and resets wrappers that count steps. Raises `InputError` for other options."""
+        """Begin an episode. Equal seeds give bitwise equal episodes. With ``options={"state": state}`` the environment
+        returns to a saved state, as with `restore`, and wrappers that count steps are reset. Raises `InputError` for
+        unknown options."""
         if not self._envs.closed and (state := saved_option(options, seed)) is not None:
             return self.restore(state), {}
         super().reset(seed=seed)
@@ -166,12 +171,13 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return seen[0], info
 
     def step(self, action: NDArray) -> tuple[Observation, float, bool, bool, Info]:
-        """Advance the episode by one action, clipped to -1 to 1. An episode is truncated after the task's number of
-        steps, or after ``max_episode_steps`` of `gymnasium.make`. If the simulation diverges, the episode is
-        terminated, ``info["diverged"]`` is a sentence about it, and the observation is the previous one.
+        """Advance the episode by one action, which is clipped to the range from -1 to 1.
 
-        Raises `InputError` for an action of a wrong shape or with numbers that are not finite, and if no episode is in
-        progress.
+        An episode is truncated after the task's number of steps, or after ``max_episode_steps`` of `gymnasium.make`. If
+        the simulation diverges, the episode is terminated, ``info["diverged"]`` describes the problem, and the
+        observation is the previous one.
+
+        Raises `InputError` if the action has a wrong shape or is not finite, or if no episode is in progress.
         """
         if self._envs.closed or self._envs._over.any():
             when = "after the end of an episode" if self._begun else "before the first one"
@@ -183,7 +189,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return seen[0], float(rewards[0]), bool(lost[0]), bool(truncated[0]), info
 
     def close(self) -> None:
-        """Close the environment, which can then begin no episode."""
+        """Close the environment. No episode can begin afterwards."""
         self._envs.close()
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -191,29 +197,29 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return pictures(self.scenes)[0] if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return the state of the episode and of the random generator. `restore` accepts it any number of times, also
-        in other environments of the same task. Raises `InputError` before the first `reset`."""
+        """Return the state of the episode and of the random generator for `restore`. It can be restored several times,
+        also in different environments of the same task. Raises `InputError` before the first `reset`."""
         if not self._begun and not self._envs.closed:
             raise InputError("save is called before the first reset(), but must come after it.")
         return self._envs.save()
 
     def restore(self, state: EnvState) -> Observation:
-        """Go back to a saved state and return its observation. Raises `InputError` for a state of another task, batch
-        or scene."""
+        """Return to a saved state, and return its observation. Raises `InputError` for a state of a different task,
+        batch or scene."""
         self._envs._generators = [self.np_random]
         seen: Observation = self._envs.restore(state)[0]
         self._begun, self._envs._horizon = True, self.scenes.task.horizon  # a wrapper does not know its step number
         return seen
 
     def twin(self, actions: int | None = None, state: EnvState | None = None) -> Twin:
-        """Return a differentiable copy of the current episode, from its start or from a saved ``state``, over
-        ``actions`` actions, by default all that remain."""
+        """Return a differentiable copy of the current episode, from its beginning or from a saved ``state``.
+        ``actions`` is the number of actions, by default all remaining actions."""
         return Twin(self.scenes, 0, actions, state)
 
 
 class FluidVectorEnv(VectorEnv):
-    """A Gymnasium vector environment: a batch of scenes. Each scene gives the same bits as a single environment with
-    the same seed."""
+    """A Gymnasium vector environment, which simulates a batch of scenes. The results of each scene are bitwise equal to
+    the results of a single environment with the same seed."""
 
     def __init__(
         self,
@@ -228,9 +234,12 @@ class FluidVectorEnv(VectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
     ):
-        """Make a batch of ``num_envs`` scenes. ``autoreset_mode`` is as in `gymnasium.vector.SyncVectorEnv`.
-        ``max_episode_steps``: number of steps after which an episode is truncated, by default the task's horizon. Other
-        arguments are those of `FluidEnv`."""
+        """Make a batch of ``num_envs`` scenes.
+
+        ``autoreset_mode`` is the same as in `gymnasium.vector.SyncVectorEnv`. ``max_episode_steps`` is the number of
+        steps of an episode before it is truncated, by default the task's horizon. `FluidEnv` describes the remaining
+        arguments.
+        """
         self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)
         try:
             self._mode = AutoresetMode(autoreset_mode)
@@ -252,14 +261,15 @@ class FluidVectorEnv(VectorEnv):
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Slices of an observation by the name of its parts."""
+        """Slices of an observation by the names of its parts."""
         return self.scenes.layout
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Begin all episodes, or those that ``options={"reset_mask": (num_envs,) bool}`` chooses. A number as ``seed``
-        gives environment b the seed + b. ``options={"state": state}`` goes back to a saved state, as `restore` does."""
+        """Begin all episodes, or the episodes chosen by ``options={"reset_mask": mask}`` with a bool array (num_envs,).
+        If ``seed`` is a number, environment b gets the seed + b. With ``options={"state": state}`` the environments
+        return to a saved state."""
         self._require_open("reset")
         if (state := saved_option(options, seed, "reset_mask")) is not None:
             return self.restore(state), {}
@@ -283,9 +293,12 @@ class FluidVectorEnv(VectorEnv):
         return self._observations.copy(), {}
 
     def step(self, actions: NDArray) -> tuple[Observation, NDArray, NDArray, NDArray, Info]:
-        """Advance all episodes by actions (num_envs, a); see `FluidEnv.step`. The autoreset mode decides when an ended
-        episode begins again: in the next step, which ignores the action; in the same step, with the last observation
-        and info in ``infos["final_obs"]`` and ``infos["final_info"]``; or only by `reset`."""
+        """Advance all episodes by actions (num_envs, a), like `FluidEnv.step`.
+
+        The autoreset mode decides when a new episode begins. In NEXT_STEP mode the next step ignores the action and
+        begins the episode. In SAME_STEP mode the episode begins at once, and the last observation and info are in
+        ``infos["final_obs"]`` and ``infos["final_info"]``. In DISABLED mode only `reset` begins an episode.
+        """
         self._require_open("step")
         actions = checked_actions("actions", actions, self._shape)
         if self._over.any() and self._mode is not AutoresetMode.NEXT_STEP:
@@ -318,14 +331,15 @@ class FluidVectorEnv(VectorEnv):
         return tuple(pictures(self.scenes)) if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return the state of all episodes and random generators; see `FluidEnv.save`. ``state[[0, 0, 2]]`` selects
-        episodes from it, in any order."""
+        """Return the state of all episodes and random generators; see `FluidEnv.save`. Index the result to select and
+        reorder episodes, such as ``state[[0, 0, 2]]``."""
         self._require_open("save")
         random = [one.bit_generator.state for one in self._generators]
         return self.scenes.save(self._over, self._observations, random)
 
     def restore(self, state: EnvState) -> Observation:
-        """Go back to a saved state of as many environments and return its observations; see `FluidEnv.restore`."""
+        """Return to a saved state with the same number of environments, and return its observations. See
+        `FluidEnv.restore`."""
         self._require_open("restore")
         self.scenes.restore(state)
         for generator, own in zip(self._generators, state.generators, strict=True):
@@ -334,7 +348,7 @@ class FluidVectorEnv(VectorEnv):
         return self._observations.copy()
 
     def twin(self, number: int, actions: int | None = None, state: EnvState | None = None) -> Twin:
-        """Return a differentiable copy of the episode of one environment; see `FluidEnv.twin`."""
+        """Return a differentiable copy of the episode of environment ``number``. See `FluidEnv.twin`."""
         return Twin(self.scenes, number, actions, state)
 
     def _require_open(self, what: str) -> None:
@@ -342,14 +356,13 @@ class FluidVectorEnv(VectorEnv):
             raise InputError(f"{what} is called after close(), but must come before it.")
 
     def _begin(self, which: NDArray) -> dict[int, Start]:
-        """Begin episodes in the environments of a mask (num_envs,), and return their starts."""
+        """Begin episodes in the environments marked in ``which`` (num_envs,), and return the initial states."""
         starts = {b: self.scenes.drawn(self._generators[b]) for b in np.flatnonzero(which).tolist()}
         self.scenes.begin(starts)
         self._over = self._over & ~which
         return starts
 
     def _observe(self, which: NDArray) -> None:
-        """Observe the environments of a mask (num_envs,); others keep their last observation."""
         self._observations = np.where(which[:, None], self.scenes.observed(), self._observations)
 
 
@@ -367,7 +380,7 @@ def checked_render_mode(mode: str | None) -> str | None:
 
 
 def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
-    """Return the state among the options of a reset, or None; raise `InputError` for options that do not fit."""
+    """Return the saved state in the options of a reset, or None. Raises `InputError` for unsuitable options."""
     require_table("options", options or {}, "{'state': state}")
     found, known = options or {}, ("state", *others)
     for name in found:

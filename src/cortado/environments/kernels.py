@@ -1,4 +1,4 @@
-"""Kernels for observations and rewards, one thread per particle, for all scenes of a batch."""
+"""Kernels for observations and rewards of all scenes of a batch, with one thread per particle."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -14,8 +14,11 @@ FAR = wp.constant(1.0e30)
 
 @cache
 def environment_kernels(precision: Precision) -> Any:
-    """Make the kernels, by name. They store float64 values, one per particle. ``per``: particles of a scene; ``factor``
-    (scenes,) multiplies derivatives. ``period`` [m] and ``frequency`` [1/m] are 0 along axes that are not periodic."""
+    """Build the kernels, which store one float64 value per particle.
+
+    ``per`` is the number of particles of a scene. Derivatives are multiplied by ``factor`` (scenes,). ``period`` [m]
+    and ``frequency`` [1/m] are the lengths and inverse lengths of the periodic box, 0 along axes without a period.
+    """
     real, vector = precision.real, precision.vector
     module, boxes = kernel_module(f"environments_{precision.name}"), wp.array2d(dtype=vector)
     samples, names = wp.array(dtype=wp.float32, ndim=4), "r period frequency x v place"
@@ -27,13 +30,12 @@ def environment_kernels(precision: Precision) -> Any:
 
     @wp.func
     def shortest(r: vector, period: vector, frequency: vector):
-        """Return a difference of positions, shortened to the nearest periodic image."""
         return r - wp.cw_mul(rounded(wp.cw_mul(r, frequency)), period)
 
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def sample(per: int, origin: vector, period: vector, frequency: vector, chosen, x, v, seen: samples):
-        """Store positions, wrapped into the period, and velocities of the ``chosen`` particles."""
+        """Store velocities and positions of the ``chosen`` particles. Positions are moved into the periodic box."""
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
         lap = wp.floor((x[i][axis] - origin[axis]) * frequency[axis])
@@ -48,8 +50,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.func
     @typed
     def outside(r, angle, period, frequency, b: int, lower: boxes, upper: boxes):
-        """Return the particle's position in the frame of the boxes, and the vector to it from the nearest point of any
-        box."""
+        """Return the particle's position relative to the boxes, and the vector from the nearest box to the particle."""
         place, found, least = vector(), vector(), real(FAR)
         for k in range(lower.shape[1]):
             middle = turned(real(0.5) * (lower[b, k] + upper[b, k]), angle)
@@ -67,7 +68,8 @@ def environment_kernels(precision: Precision) -> Any:
     def share(
         per: int, width: real, period: vector, frequency: vector, x, place, turn, lower: boxes, upper: boxes, value
     ):
-        """Store 1 / (1 + e^2 / w^2), where e is the distance to the nearest box; boxes may move with a solid."""
+        """Store 1 / (1 + e^2 / w^2) for each particle, with the distance e to the nearest box and the ``width`` w.
+        Boxes may move with a solid."""
         i = wp.tid()
         b = i // per
         _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
@@ -103,7 +105,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def apart(per: int, period: vector, frequency: vector, chosen, x, value: wp.array2d(dtype=wp.float64)):
-        """Store the sum of distances |dx| + |dy| + |dz| to all chosen particles, between nearest images."""
+        """Store the sum of the distances |dx| + |dy| + |dz| from each particle to all chosen particles."""
         b, p = wp.tid()
         own, total = x[b * per + chosen[p]], wp.float64(0.0)
         for q in range(chosen.shape[0]):
@@ -129,7 +131,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def missed(per: int, step, target: wp.array2d(dtype=vector), weight: wp.array2d(dtype=real), x, value):
-        """Store the weighted squared distance to the particle's target in this step."""
+        """Store the weighted squared distance from each particle to its target in the current step."""
         i = wp.tid()
         k, p = step[i // per], i % per
         r = x[i] - target[k, p]

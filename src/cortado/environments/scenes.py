@@ -1,6 +1,7 @@
-"""Step many scenes of one task in one launch, each in its episode, and save and restore their states.
+"""Step many scenes of one task together, and save and restore their states.
 
-On a CPU, only launches with few particles are captured graphs; a batch of medium size is split into such launches.
+On a CPU, only launches with few particles are captured as graphs. A batch of medium size is therefore split into
+several launches.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -34,40 +35,40 @@ from cortado.simulation import Simulation
 
 JITTER = 0.02
 LANES = 1
-"""Lanes per particle: the same for all batches, for equal bits."""
+"""Number of lanes per particle. It is fixed so that batches of all sizes have equal bits."""
 SEEN = 32
 MOST_PARTS = 16
-"""Greatest number of parts of a batch; a batch that needs more is large enough for all cores without graphs."""
+"""Greatest number of launches for a batch. Larger batches use all cores without graphs."""
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
     positions: NDArray
-    """(n, d) [m]"""
+    """Positions (n, d) [m]."""
     goal: NDArray
-    """(g,)"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EnvState:
-    """The saved state of an environment or batch; `save` returns it and `restore` accepts it.
+    """The saved state of an environment or a batch, returned by `save` and accepted by `restore`.
 
-    The state shares the environment's device arrays, which no step overwrites. Pickles and copies have NumPy arrays.
+    The state shares device arrays with the environment, which no step overwrites. After pickling or copying, it has
+    NumPy arrays.
     """
 
     kind: str
-    """Number of scenes, task, size, precision and observed numbers in words; a restored state must have the same."""
+    """Text with the number of scenes, task, size, precision and observation. A state can only be restored in
+    environments with the same text."""
     scene: Scene
     fields: Mapping[str, Any]
-    """Fields of the fluid by name, (scenes n,) Warp arrays, or NumPy arrays of their numbers."""
+    """Fields of the fluid by name (scenes * n,), as Warp or NumPy arrays."""
     clocks: tuple[RestartState, ...]
-    """Clock and origin of each scene, as restart states without fields."""
+    """Time, step number and origin of each scene."""
     step_number: NDArray
-    """Number of environment steps (scenes,) since each episode began."""
+    """Number of environment steps in the episode of each scene (scenes,)."""
     starts: tuple[Start, ...]
-    """Start of each scene's episode."""
     driven: tuple[NDArray, ...]
-    """For each actuator the driven components and the commands: (scenes, 2, a)."""
+    """Driven components and commands of each actuator (scenes, 2, a)."""
     lost: frozenset[int]
     over: NDArray
     """Mask (scenes,) of ended episodes."""
@@ -79,7 +80,7 @@ class EnvState:
         return len(self.step_number)
 
     def __getitem__(self, numbers: int | Iterable[int]) -> "EnvState":
-        """Return the state of a batch of the scenes with these numbers. Numbers may repeat: ``state[[0] * 8]`` is a
+        """Return the state of a batch that consists of the chosen scenes. Numbers may repeat: ``state[[0] * 8]`` is a
         batch of eight scenes in the state of scene 0, with equal random generators."""
         chosen = list(numbers) if isinstance(numbers, Iterable) else [numbers]
         if not chosen or any(not isinstance(b, (int, np.integer)) or not 0 <= b < len(self) for b in chosen):
@@ -107,7 +108,6 @@ class EnvState:
 
 @WARP
 def _picked(array: Any, chosen: list[int], scenes: int) -> Any:
-    """Return the parts of an array (scenes n,) that belong to the chosen scenes, one after the other."""
     n = len(array) // scenes
     parts = [array[b * n : (b + 1) * n] for b in chosen]
     if isinstance(array, np.ndarray):
@@ -130,7 +130,8 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """A stepper that splits a batch into parts and takes ``steps`` steps of each, without a change of any bit."""
+    """A stepper that splits a batch into parts and advances each part by ``steps`` steps. The split does not change the
+    bits of the result."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
         scenes = simulation.batch or 1
@@ -181,7 +182,7 @@ def _together(like: State, parts: list[DeviceState]) -> DeviceState:
 
 
 class Scenes:
-    """A batch of scenes of one task that are stepped together, each in its episode."""
+    """A batch of scenes of one task, which are stepped together. Each scene has its own episode."""
 
     def __init__(
         self,
@@ -214,7 +215,7 @@ class Scenes:
         self._now = [one.at_rest(scenes) for one in task.actuators]
         self.starts: list[Start] = [Start(self.simulation.positions, self.goal[b]) for b in range(scenes)]
         self._lost: set[int] = set()
-        """Numbers of diverged scenes, whose states are meaningless."""
+        """Numbers of diverged scenes. Their states are meaningless."""
         self._given = task, scenes, device, precision, seen, sensors
         still = {name: np.repeat(row, task.substeps, axis=1) for name, row in self._driven.items()}
         with unwarned():  # see `advance`
@@ -238,7 +239,6 @@ class Scenes:
             return Simulation(self.task.scene, self.simulation.device.alias, self.simulation.precision.name)
 
     def save(self, over: NDArray | None = None, observations: NDArray | None = None, generators: Any = ()) -> EnvState:
-        """Return the state of all scenes; ``over``, ``observations`` and ``generators`` are those of an environment."""
         arrays, none = self.state.arrays, np.zeros(len(self))
         return EnvState(
             kind=self.kind,
@@ -256,7 +256,7 @@ class Scenes:
 
     @WARP
     def taken(self, saved: EnvState) -> DeviceState:
-        """Return the states that were saved; raise `InputError` for those of another task, batch or scene."""
+        """Return the saved states. Raises `InputError` for states of a different task, batch or scene."""
         if not isinstance(saved, EnvState):
             raise InputError(f"state is {shown(saved)}, but must be a state that an environment has saved.")
         own = self.simulation.scene
@@ -300,8 +300,8 @@ class Scenes:
         self.state = DeviceState(arrays, tuple(scenes))
 
     def step(self, actions: NDArray) -> tuple[NDArray, dict[int, str]]:
-        """Step all scenes with actions (scenes, a) from -1 to 1. Return the rewards (scenes,) and, by scene number, a
-        sentence on each diverged scene, which must begin a new episode."""
+        """Step all scenes with actions (scenes, a) from -1 to 1. Return the rewards (scenes,), and the error messages
+        of diverged scenes by scene number. Diverged scenes must be reset."""
         self.advance(actions)
         rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
         lost = {}
@@ -322,7 +322,7 @@ class Scenes:
 
     @property
     def parts(self) -> dict[str, NDArray]:
-        """Observed arrays by name, with a first axis for the scenes: see `docs/environments.md`."""
+        """Return the observed arrays by name, with a first axis for the scenes. See `docs/environments.md`."""
         arrays, task = self.state.arrays, self.task
         now = {one.parameter: own for one, own in zip(task.actuators, self._now, strict=True)}
         free = {name: self._free(arrays, name) for name in task.free_solids}
@@ -332,12 +332,12 @@ class Scenes:
 
     @property
     def _driven(self) -> dict[str, NDArray]:
-        """Current values of the parameters that actions drive, (scenes, 1, ...) by name."""
+        """Return the current values of the parameters that actuators drive (scenes, 1, ...), by name."""
         each = zip(self.task.actuators, self._now, strict=True)
         return {one.parameter: one.value(now[:, None, 0]) for one, now in each}
 
     def observed(self) -> NDArray[np.float32]:
-        """Return all observations (scenes, k) as float32; rows of diverged scenes are meaningless."""
+        """Return all observations (scenes, k) as float32. Observations of diverged scenes are meaningless."""
         flat = [np.reshape(part, (len(self), -1)) for part in self.parts.values()]
         return np.concatenate(flat, axis=1, dtype=np.float32, casting="same_kind")
 
@@ -378,7 +378,7 @@ class Scenes:
         return {name: np.array([value_of(sensor, one) for one in end]) for name, sensor in self._sensors.items()}
 
     def _free(self, state: State, name: str) -> NDArray:
-        """Return for a free body (scenes, 7): position, cosine and sine of its angle, velocity, angular velocity."""
+        """Return position, cosine and sine of the angle, velocity and angular velocity of a free body (scenes, 7)."""
         fields = position_name(name), f"{name}.{AXES[0]}", velocity_name(name)
         place, axis, velocity = (state[field].numpy()[:, :2] for field in fields)
         rate = state[angular_velocity_name(name)].numpy()[:, None]

@@ -1,4 +1,4 @@
-"""`StableBaselinesVecEnv`, a `VecEnv` of Stable-Baselines3 whose scenes are stepped in one launch."""
+"""The vector environment of Stable-Baselines3."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -21,7 +21,7 @@ __all__ = ["StableBaselinesVecEnv"]
 
 
 class OneOfBatch:
-    """One environment of a batch, with what `get_attr`, `set_attr` and `env_method` can use."""
+    """One environment of a batch, for `get_attr`, `set_attr` and `env_method`."""
 
     def __init__(self, envs: FluidVectorEnv, number: int):
         self._envs, self._number = envs, number
@@ -44,25 +44,27 @@ class OneOfBatch:
 
 
 class StableBaselinesVecEnv(VecEnv):
-    """A batch of environments of one task as a `VecEnv` of Stable-Baselines3; see `docs/environments.md`.
+    """A batch of environments of one task as a `VecEnv` of Stable-Baselines3. `docs/environments.md` describes it.
 
-    An ended episode begins again in the same step. ``infos[b]["terminal_observation"]`` is the last observation of the
-    old episode; ``infos[b]["TimeLimit.truncated"]`` is True unless the scene diverged.
+    When an episode ends, a new episode begins in the same step. ``infos[b]["terminal_observation"]`` is then the last
+    observation of the ended episode of environment b. ``infos[b]["TimeLimit.truncated"]`` is True unless the simulation
+    diverged.
     """
 
     def __init__(self, task: str | Task, num_envs: int = 1, **settings: Any):
-        """Make ``num_envs`` environments of a task, such as "Carry"; ``settings`` are arguments of `FluidVectorEnv`,
-        without ``autoreset_mode``."""
+        """Make ``num_envs`` environments of a task, such as "Carry". ``settings`` are arguments of `FluidVectorEnv`
+        except ``autoreset_mode``."""
         if "autoreset_mode" in settings:
             raise InputError("autoreset_mode is given, but must be left out, as Stable-Baselines3 has only one mode.")
         self.envs = FluidVectorEnv(task, num_envs, **settings, autoreset_mode="SameStep")
-        """The same batch as a vector environment of Gymnasium."""
+        """The batch as a Gymnasium vector environment."""
         self._each = [OneOfBatch(self.envs, number) for number in range(num_envs)]
         self._actions: NDArray | None = None
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
 
     def reset(self) -> Observation:
-        """Begin all episodes with the seeds of `seed` and the options of `set_options`; both are used only once."""
+        """Begin all episodes with the seeds from `seed` and the options from `set_options`. Seeds and options are used
+        once."""
         options = self._options[0]
         if any(one is not options and one != options for one in self._options):
             raise InputError("options differ from environment to environment, but must be the same for a whole batch.")
@@ -76,7 +78,7 @@ class StableBaselinesVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Advance all episodes by the stored actions; return observations, rewards, ended episodes, and infos."""
+        """Advance all episodes by the stored actions. Return observations, rewards, ended episodes, and infos."""
         if self._actions is None:
             raise InputError("step_wait is called without actions, but must come after step_async(actions).")
         actions, self._actions = self._actions, None
@@ -89,20 +91,19 @@ class StableBaselinesVecEnv(VecEnv):
         return seen, rewards.astype(np.float32), terminated | truncated, infos
 
     def close(self) -> None:
-        """Close the environments, which can then begin no episode."""
+        """Close the environments. No episode can begin afterwards."""
         self.envs.close()
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:
-        """Return a picture (rows, columns, 3) of each scene, or None with no ``render_mode``."""
+        """Return a picture (rows, columns, 3) of each scene, or None without ``render_mode``."""
         return list(self.envs.render() or [None] * self.num_envs)
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return an attribute of each environment, such as ``goal``, ``step_number`` and ``layout``."""
+        """Return an attribute of each environment, such as ``goal``, ``step_number`` or ``layout``."""
         return [getattr(one, attr_name) for one in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Set a new attribute on each environment; raises `InputError` for attributes that belong to the whole
-        batch."""
+        """Set a new attribute on each environment. Raises `InputError` for attributes of the whole batch."""
         if attr_name not in vars(self._each[0]) and hasattr(self._each[0], attr_name):
             raise InputError(f"{attr_name} cannot be set, as it belongs to the batch; make another environment.")
         for one in self._chosen(indices):
@@ -111,11 +112,11 @@ class StableBaselinesVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *arguments: Any, indices: int | Iterable[int] | None = None, **named: Any
     ) -> list[Any]:
-        """Call a method of each environment: ``twin`` or ``save``."""
+        """Call the method ``twin`` or ``save`` of each environment."""
         return [getattr(one, method_name)(*arguments, **named) for one in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: int | Iterable[int] | None = None) -> list[bool]:
-        """Return False for each environment: environments of a batch have no wrappers."""
+        """Return False for each environment, because the environments of a batch have no wrappers."""
         return [False for _ in self._chosen(indices)]
 
     def _chosen(self, indices: int | Iterable[int] | None) -> list[OneOfBatch]:

@@ -1,5 +1,5 @@
-"""Base classes of control tasks. An `Actuator` converts actions, numbers from -1 to 1 that are constant during an
-environment step, to a parameter over time. The parameter is affine in the actions."""
+"""Base classes of control tasks. An `Actuator` converts actions to the values of a parameter over time, which are an
+affine function of the actions. Actions are numbers from -1 to 1, constant during an environment step."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -19,31 +19,33 @@ from cortado.simulation import Simulation
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """An actuator sets some components of one parameter over time. During an environment step its command changes
-    linearly from the previous command to ``greatest`` times the action."""
+    """An actuator sets some components of a parameter over time. Its command is ``greatest`` times the action, and is
+    interpolated linearly between environment steps."""
 
     parameter: str
     """Name of the driven parameter, such as "cup.displacement"."""
     rest: tuple[float, ...]
-    """Value (d,) of the parameter before any action; one entry if the parameter is a number."""
+    """Value of the parameter before any action (d,). A scalar parameter has one entry."""
     axes: tuple[int, ...]
-    """Indices (a,) of the driven components."""
+    """Indices of the driven components (a,)."""
     greatest: tuple[float, ...]
-    """Commands (a,) that an action of 1 gives."""
+    """Commands of the actions 1 (a,)."""
     is_number: bool = False
-    """True if the parameter is a number at each step, such as an angle in the plane."""
+    """True if the parameter is a scalar, such as an angle in the plane."""
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """Return the driven components (..., a) one simulation step after ``q``, given the ``command``."""
+        """Return the driven components (..., a) after one simulation step, given the components ``q`` before
+        the step."""
 
     def at_rest(self, members: int) -> NDArray:
-        """Return the driven components and the commands before any action, (members, 2, a)."""
+        """Return the driven components and the commands before any action (members, 2, a)."""
         return np.zeros((members, 2, len(self.axes)))
 
     def advance(self, now: NDArray, u: NDArray, steps: int, time_step: float) -> tuple[NDArray, NDArray]:
-        """Take ``steps`` simulation steps with actions ``u`` (members, a). Return components and commands (members, 2,
-        a) at the end, and the parameter after each step, (members, steps, d) or (members, steps)."""
+        """Take ``steps`` simulation steps with actions ``u`` (members, a). Return the final components and commands
+        (members, 2, a), and the parameter after each step. The parameter is (members, steps, d), or (members, steps)
+        for a scalar."""
         driven, last = [now[:, 0]], now[:, 1]
         wanted = np.array(self.greatest) * u
         for j in range(steps):
@@ -51,14 +53,14 @@ class Actuator(ABC):
         return np.stack([driven[-1], wanted], axis=1), self.value(np.stack(driven[1:], axis=1))
 
     def value(self, q: NDArray) -> NDArray:
-        """Return the parameter, (..., d) or (...), given its driven components (..., a)."""
+        """Return the parameter (..., d), or (...) for a scalar, from its driven components (..., a)."""
         found = np.tile(np.array(self.rest, dtype=np.float64), (*q.shape[:-1], 1))
         found[..., self.axes] += q
         return found[..., 0] if self.is_number else found
 
     def over(self, actions: int, steps: int, time_step: float, begun: NDArray | None = None) -> Affine:
-        """Return the parameter as an affine function of actions (actions, a), each held for ``steps`` simulation steps.
-        ``begun``: components and commands (1, 2, a) at the start, by default those at rest."""
+        """Return the parameter as an affine function of actions (actions, a). Each action lasts ``steps`` simulation
+        steps. ``begun`` has the initial components and commands (1, 2, a), by default at rest."""
         a = len(self.axes)
         units = np.concatenate([np.zeros((1, actions, a)), np.eye(actions * a).reshape(-1, actions, a)])
         now, parts = np.repeat(self.at_rest(1) if begun is None else begun, len(units), axis=0), []
@@ -71,7 +73,8 @@ class Actuator(ABC):
 
 @dataclass(frozen=True)
 class Velocity(Actuator):
-    """An actuator whose actions are velocities: q' = c, with ``greatest`` in m/s or rad/s."""
+    """An actuator with velocities as actions. The command is the time derivative of the driven component. ``greatest``
+    is in m/s or rad/s."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step * command
@@ -79,10 +82,11 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """An actuator whose actions are values of the parameter, approached with a lag: q' = (c - q) / lag."""
+    """An actuator with target values as actions. The driven component approaches the command exponentially with the
+    time constant ``lag``."""
 
     lag: float = 0.1
-    """Time constant of the approach [s]."""
+    """Time constant of the actuator [s]."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step / self.lag * (command - q)
@@ -90,28 +94,29 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """A control task: a scene with actuators, reward and goals, in a small or a large size."""
+    """The base class of control tasks. A task has a scene, actuators, a reward and goals, in a small and a
+    large size."""
 
     size: str = "small"
-    """"small", for a CPU, or "large", for a GPU, with `finer` times as many particles along each axis."""
+    """"small", for a CPU, or "large", for a GPU. The large size has `finer` times as many particles along each axis."""
     dimension: ClassVar[int] = 2
     finer: ClassVar[int] = 3
-    """Factor by which the large size has a smaller spacing and a shorter time step."""
+    """Ratio of the spacings, and of the time steps, of the small and the large size."""
     name: ClassVar[str]
     horizon: ClassVar[int]
-    """Environment steps after which an episode is truncated."""
+    """Number of environment steps before an episode is truncated."""
     repeats: ClassVar[int]
-    """Simulation steps of the small size in one environment step."""
+    """Number of simulation steps in an environment step of the small size."""
     coarse_spacing: ClassVar[float]
     """Particle spacing of the small size [m]."""
     coarse_step: ClassVar[float]
     """Time step of the small size [s]."""
     lowest: ClassVar[float]
-    """Smallest reward of a step; a diverged episode gets it for every missing step."""
+    """Least reward of a step. A diverged episode gets this reward for every missing step."""
     free_solids: ClassVar[tuple[str, ...]] = ()
-    """Names of solids moved by the fluid, whose motion is observed."""
+    """Names of the rigid bodies that are observed."""
     goal_names: ClassVar[tuple[str, ...]] = ()
-    """Descriptions of the numbers of a goal, with units."""
+    """Descriptions of the components of a goal, with units."""
 
     def __post_init__(self) -> None:
         if self.size not in ("small", "large"):
@@ -141,12 +146,12 @@ class Task(ABC):
     @property
     @abstractmethod
     def scene(self) -> Scene:
-        """The scene that the environment simulates."""
+        """The simulated scene."""
 
     @property
     @abstractmethod
     def actuators(self) -> tuple[Actuator, ...]:
-        """Actuators, in the order of the numbers of an action."""
+        """Actuators, in the order of the components of an action."""
 
     @property
     def driven(self) -> list[str]:
@@ -154,11 +159,11 @@ class Task(ABC):
 
     @abstractmethod
     def reward(self, simulation: Simulation) -> Reward:
-        """Return the reward function of a step, given a simulation of the scene."""
+        """Return the reward function of an environment step, given a simulation of the scene."""
 
     @property
     def goals(self) -> tuple[NDArray, NDArray]:
-        """Lower and upper bounds (g,) of the random goals of episodes."""
+        """Lower and upper bounds of the random goals (g,)."""
         return np.zeros(0), np.zeros(0)
 
     def scene_of(self, **tables: Any) -> Scene:
@@ -171,7 +176,7 @@ class Task(ABC):
 
 
 def checked_scene(task: Task) -> Scene:
-    """Return the scene of a task; raise `InputError` unless its time step is the task's."""
+    """Return the scene of a task. Raises `InputError` if its time step differs from the task's."""
     scene = task.scene
     found, wanted = scene.solver.time_step, task.time_step
     if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):
@@ -183,7 +188,8 @@ def checked_scene(task: Task) -> Scene:
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return actions clipped to -1 and 1; raise `InputError` for another shape and for values that are not finite."""
+    """Return actions clipped to the range from -1 to 1. Raises `InputError` for a wrong shape and for values that are
+    not finite."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")

@@ -22,14 +22,14 @@ from cortado.scene.motions import AXES, position_name, turn_name
 
 @dataclass(frozen=True, eq=False)
 class StepEnd:
-    """The states of all scenes after a step of the environment."""
+    """The states of all scenes after an environment step."""
 
     state: State
-    """Fields of all particles, (scenes n,)."""
+    """Fields of all particles (scenes * n,)."""
     goal: NDArray
     """Goals (scenes, g)."""
     step: NDArray
-    """Number of the step in each scene's episode (scenes,), counted from 1."""
+    """Number of the step in the episode of each scene (scenes,), counted from 1."""
     domain: Domain = WITHOUT_PERIODS
 
     @property
@@ -47,17 +47,17 @@ class StepEnd:
 
 
 class Term(Protocol):
-    """Protocol of a reward term: one number for each scene, with its derivative."""
+    """Protocol of a reward term. It returns a number for each scene, and the derivative of this number."""
 
     def values(self, at: StepEnd) -> NDArray:
-        """Return the value of the term for each scene, (scenes,)."""
+        """Return the value of the term for each scene (scenes,)."""
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State) -> None:
-        """Add ``factor`` (scenes,) times the term's derivative to an adjoint of the states."""
+        """Add ``factor`` (scenes,) times the derivative of the term to ``bar``, which is the adjoint of the states."""
 
 
 Boxes = Callable[[NDArray], tuple[NDArray, NDArray]]
-"""A function from goals (scenes, g) to lower and upper corners of boxes (scenes, boxes, d) [m]."""
+"""A function that maps goals (scenes, g) to lower and upper corners of boxes (scenes, boxes, d) [m]."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class OneBox:
 
 
 class OverParticles:
-    """A reward term that sums a kernel over particles; the kernel's derivative has its name with ``_adjoint``."""
+    """A reward term that sums the values of a kernel over particles. The adjoint kernel has the suffix ``_adjoint``."""
 
     kernel: str
 
@@ -94,7 +94,8 @@ class OverParticles:
         return total(value.flatten()).numpy() / self._over(at)
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
-        """Add ``factor`` times the derivative to ``bar``; ``others``: further output arrays of the kernel."""
+        """Add ``factor`` times the derivative of the term to ``bar``. ``others`` are further output arrays of the
+        kernel."""
         scaled = _reals(at, factor / self._over(at))
         self._launch(f"{self.kernel}_adjoint", at, factor=scaled, x_bar=bar.positions, **others)
 
@@ -104,7 +105,6 @@ class OverParticles:
         launch(getattr(kernels, name), self._threads(at), x.device, **own, **arguments)
 
     def _threads(self, at: StepEnd) -> tuple[int, ...]:
-        """Return the shape of the kernel's launch, by default one thread for each particle."""
         return (at.scenes * at.per,)
 
     def _over(self, at: StepEnd) -> float:
@@ -114,7 +114,7 @@ class OverParticles:
         raise NotImplementedError
 
     def _kept(self, key: Any, at: StepEnd, make: Callable[[], Any]) -> Any:
-        """Return an object made once for each device, precision and number of scenes."""
+        """Return a cached object for each device, precision and number of scenes."""
         key = key, str(at.state.positions.device), at.state.positions.dtype, at.scenes
         if key not in self._made:
             self._made[key] = make()
@@ -122,13 +122,14 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """A reward term: the fraction of the fluid in boxes, counted smoothly. A particle at distance e from the nearest
-    box counts 1 / (1 + e^2 / w^2): 1 inside, 1/2 at distance w, with a gradient everywhere outside."""
+    """A reward term: the fraction of the fluid in boxes, as a smooth function of particle positions. The weight of a
+    particle is 1 inside a box and 1/2 at the distance ``width`` from the nearest box. Its gradient is not 0 outside."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes and the width w [m]. With a ``solid``, boxes move and turn with it, in 3-D about z only."""
+        """Set the boxes and the width of their smooth boundary [m]. If a ``solid`` is given, the boxes move and turn
+        with the solid. In 3-D they turn only about z."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -164,13 +165,13 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` over all pairs of chosen particles, divided by ``everywhere``,
-    between nearest periodic images."""
+    """A reward term: the mean distance ``|dx| + |dy|`` over all pairs of chosen particles, divided by ``everywhere``.
+    Distances are to the nearest periodic images."""
 
     kernel = "apart"
 
     def __init__(self, chosen: NDArray, everywhere: float):
-        """Set the indices ``chosen`` (m,) of particles, and the length ``everywhere`` [m]."""
+        """Set the indices ``chosen`` (m,) of the particles and the length ``everywhere`` [m]."""
         super().__init__(chosen, everywhere)
         self._chosen, self._pairs = chosen, len(chosen) ** 2 * everywhere
 
@@ -187,13 +188,13 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """A reward term: the weighted sum of squared distances of particles to targets that change from step to step. A
-    particle one period away from its target counts as far away, also along periodic axes."""
+    """A reward term: the weighted sum of squared distances of particles from targets, which change from step to step.
+    The targets have no periodic images."""
 
     kernel = "missed"
 
     def __init__(self, targets: NDArray, weights: NDArray):
-        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n), with step k, counted from 1, at index k - 1."""
+        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n). The first entry is for step 1."""
         super().__init__(targets, weights)
         self._targets, self._weights = targets, weights
 
@@ -206,7 +207,7 @@ class Missed(OverParticles):
 
 @dataclass(frozen=True)
 class Miss:
-    """A reward term: the difference ``|value - goal|`` between another term and the first number of the goal."""
+    """A reward term: the absolute difference between a term's value and the first component of the goal."""
 
     term: Term
 
@@ -219,7 +220,7 @@ class Miss:
 
 @dataclass(frozen=True)
 class Distance:
-    """A reward term: the distance ``|x - x*|`` [m] along the first axis between a solid's middle and its goal."""
+    """A reward term: the distance between the centre of a solid and the goal along the first axis [m]."""
 
     solid: str
 
@@ -232,8 +233,8 @@ class Distance:
 
 @dataclass(frozen=True)
 class Pose:
-    """A reward term of a free body in the plane: (x - x*)^2 / l^2 + 2 (1 - cos angle), with the goal x* along the first
-    axis and the body's angle."""
+    """A reward term of a free body in the plane: (x - x*)^2 / l^2 + 2 (1 - cos angle), with the body's position x along
+    the first axis, the goal x*, the length l and the body's angle."""
 
     solid: str
     length: float
@@ -250,13 +251,12 @@ class Pose:
 
     @property
     def _axes(self) -> list[tuple[int, str]]:
-        """Fields with the displaced ends of the body's axes, each with the component that is cos angle - 1."""
         return [(axis, f"{self.solid}.{name}") for axis, name in enumerate(AXES[:2])]
 
 
 @dataclass(frozen=True)
 class Reward:
-    """The reward of a step: a constant plus weighted terms."""
+    """The reward of a step, as a constant plus weighted terms."""
 
     terms: tuple[tuple[float, Term], ...]
     constant: float = 0.0
@@ -267,7 +267,7 @@ class Reward:
 
     @WARP
     def values(self, at: StepEnd) -> NDArray:
-        """Return the reward of each scene, (scenes,)."""
+        """Return the reward of each scene (scenes,)."""
         found = np.full(at.scenes, self.constant)
         for weight, term in self.terms:
             found += weight * term.values(at)
@@ -284,7 +284,7 @@ class Reward:
 
 @dataclass(frozen=True)
 class MinusReward:
-    """The loss of one step: minus its reward."""
+    """The loss of one step, which is minus its reward."""
 
     reward: Reward
     goal: NDArray
@@ -292,7 +292,7 @@ class MinusReward:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the loss and its step; checkpoints store it."""
+        """Return a text that identifies the loss and its step, for checkpoints."""
         return f"{[(weight, type(term).__name__) for weight, term in self.reward.terms]} {self.goal} {self.step}"
 
     def value(self, end: Snapshot) -> float:
@@ -314,7 +314,8 @@ class MinusReward:
 
 
 def _miss(at: StepEnd, solid: str) -> NDArray:
-    """Return the offset (scenes,) [m] of a solid's middle from its goal along axis 0, the shorter way around."""
+    """Return the distance from the goal to the centre of a solid along the first axis (scenes,) [m], to the nearest
+    periodic image."""
     return apart(_numbers(at.state, position_name(solid))[:, :1] - at.goal[:, :1], at.domain.lengths[:1])[:, 0]
 
 

@@ -1,4 +1,4 @@
-"""Files, locks, encoding of films, and messages on terminals, independent of fluids."""
+"""Files, locks, encoding of films, and messages on terminals."""
 
 from typing import TYPE_CHECKING
 

@@ -1,5 +1,5 @@
-"""Reading and writing of files. User files must be regular files of limited size, as a pipe may block and a device may
-have no end. Written files appear complete or not at all; only one process at a time writes a folder."""
+"""Read and write files. User files must be regular files of limited size, because pipes may block and devices may have
+no end. Files are written completely or not at all. Only one process at a time writes to a folder."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ OTHERS = (
 
 
 def as_path(what: str, value: Any) -> str:
-    """Return a path as text; raise `InputError` for anything else, such as numbers, which Python takes for open
-    files."""
+    """Return a path as text. Raises `InputError` for any other type. Python would interpret numbers as open files."""
     if isinstance(value, (str, os.PathLike)):
         path = os.fspath(value)
         if isinstance(path, str) and path:
@@ -43,8 +42,8 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """Return size and times of a file; raise `OSError`, with a reason in words, if it is not regular or has over
-    ``most`` bytes."""
+    """Return the size and times of a file. Raises `OSError` if the file is not regular or is larger than ``most``
+    bytes."""
     try:
         found = os.stat(path)
     except ValueError:  # a character that no name has
@@ -58,8 +57,8 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
 
 
 def cached_by_file(kept: int, most: int) -> Callable[[Callable[..., Found]], Callable[..., Found]]:
-    """Cache the last results of a function of a file's path, and of more, until the file has another time or size. The
-    function raises `InputError` for a file that is not regular or has over ``most`` bytes."""
+    """Decorate a function of a file's path, and cache its last results until the file changes. The function raises
+    `InputError` if the file is not regular or is larger than ``most`` bytes."""
 
     def decorated(read: Callable[..., Found]) -> Callable[..., Found]:
         known = lru_cache(kept)(lambda version, path, *more: read(path, *more))
@@ -99,8 +98,8 @@ MOST_BYTES = 2**28
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV table, (lines,) by the names in its first line; an empty entry is NaN. Raise
-    `InputError` for any other file."""
+    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. An empty entry is NaN.
+    Raises `InputError` if the file is no such table."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]
@@ -146,19 +145,19 @@ def examples_folder() -> Path:
 
 
 UNFINISHED = ".cortado-*.tmp"
-"""Pattern of temporary names, under which a killed process leaves unfinished files."""
+"""Pattern of the names of temporary files. A killed process may leave temporary files behind."""
 _REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def unfinished(path: Path) -> Path:
-    """Return a temporary name beside `path` that nobody can guess; open it with "x", which follows no links."""
+    """Return an unpredictable temporary name in the folder of `path`. Open the file with mode "x", which follows no
+    links."""
     return path.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file under a temporary name and rename it, so that no reader sees an incomplete file. Raise
-    `ComputationError` if the disk is full, and `InputError` for a path that cannot be created, or is a device or a
-    pipe."""
+    """Write a file under a temporary name and rename it. Readers never see an incomplete file. Raises
+    `ComputationError` if the disk is full, and `InputError` if the path cannot be written."""
     temporary = unfinished(path)
     with sentences(path):
         if path.exists() and not path.is_file() and not path.is_dir():
@@ -174,7 +173,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Test if anything exists at a path, also a broken link; raise `InputError` if the test fails."""
+    """Test whether a path exists, even as a broken link. Raises `InputError` if the test fails."""
     with sentences(path):
         try:
             path.lstat()
@@ -184,14 +183,14 @@ def is_taken(path: Path) -> bool:
 
 
 def write_fully(file: Any, content: bytes) -> None:
-    """Write all bytes to an unbuffered file, which may accept only a part per call."""
+    """Write all bytes to an unbuffered file, which may accept only some bytes per call."""
     rest = memoryview(content)
     while rest:
         rest = rest[file.write(rest) :]
 
 
 def parsed_json(text: bytes) -> Any:
-    """Return the value of a JSON text; raise `ValueError`, also for nesting too deep."""
+    """Return the value of a JSON text. Raises `ValueError` for wrong JSON or excessive nesting."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -200,8 +199,8 @@ def parsed_json(text: bytes) -> Any:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Turn `OSError` in the block into a sentence about a file or folder: `ComputationError` for a full or broken disk,
-    else `InputError`."""
+    """Replace an `OSError` by an error with a clear message: `ComputationError` for a full or broken disk, or
+    `InputError`."""
     try:
         yield
     except OSError as problem:
@@ -219,11 +218,11 @@ def make_folder(path: Path) -> None:
 
 
 BEYOND = 2**30
-"""Offset of the byte that Windows locks, far behind the content, which other processes can thus read."""
+"""Offset of the locked byte on Windows. It is far behind the content, so that the file remains readable."""
 
 
 def lock(file: int) -> None:
-    """Lock an open file until it is closed; raise `BlockingIOError` if another process holds the lock."""
+    """Lock an open file until it is closed. Raises `BlockingIOError` if another process holds the lock."""
     if sys.platform != "win32":
         import fcntl
 
@@ -245,9 +244,8 @@ _NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Make a folder, and lock it against other processes until the block ends or the process dies; raise `InputError`
-    if another process holds the lock. File systems without locks, such as some network drives, do not protect
-    folders."""
+    """Create a folder and lock it against other processes. Raises `InputError` if another process holds the lock. Some
+    network drives have no locks."""
     path = folder / LOCK
     with sentences(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -261,7 +259,6 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _open_locked(path: Path) -> int:
-    """Open and lock a file, write the name of this process into it, and return its descriptor."""
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
         try:
@@ -291,7 +288,7 @@ def _lock(file: int, folder: Path) -> None:
 
 
 def _is_at(path: Path, file: int) -> bool:
-    """Test if a path still names the open file, which another process may have removed."""
+    """Test whether a path still leads to the open file. Another process may have removed the file."""
     try:
         return os.path.samestat(os.stat(path), os.fstat(file))
     except FileNotFoundError:

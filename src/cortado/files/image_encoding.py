@@ -1,4 +1,4 @@
-"""Encoding of linear images as 8-bit sRGB (IEC 61966-2-1), as videos (H.264 in mp4), and as animated WebPs."""
+"""Encode linear images as 8-bit sRGB (IEC 61966-2-1), as H.264 videos in mp4, and as animated WebPs."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from cortado.files.terminal import held
 
 ROWS = 32
 MOST_LIGHT = 2.0
-"""Greatest value of a user's picture: noise may exceed 1 a little, while larger values must be bytes."""
+"""Greatest value in a linear picture from a user. Pictures with larger values probably contain bytes up to 255."""
 STEPS = 1 << 14
-"""Number of intervals of light from 0 to 1, each shorter than the interval of any byte value."""
+"""Number of intervals of linear light from 0 to 1. Each interval contains at most one boundary between byte values."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
 def check_light(what: str, image: ArrayLike) -> None:
-    """Raise `InputError`, in a sentence that begins with ``what``, for a picture of byte values up to 255."""
+    """Raise `InputError` if a picture contains byte values up to 255. The error message begins with ``what``."""
     if np.asarray(image).dtype.kind in "iu":
         raise InputError(f"{what} is made of whole numbers, but must be {LIGHT}.")
     light = as_numbers(what, image)
@@ -39,8 +39,9 @@ def check_light(what: str, image: ArrayLike) -> None:
 
 
 def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
-    """Return sRGB bytes (rows, columns, 3) of a linear image, clipped to 0..1; ``each`` maps a function over parts.
-    Raise `InputError` for another shape and for values that are not finite."""
+    """Return the sRGB bytes of a linear image (rows, columns, 3). Light is clipped to the range from 0 to 1. ``each``
+    maps a function over parts of the image. Raises `InputError` for a wrong shape and for values that are not finite.
+    """
     light = image if isinstance(image, np.ndarray) and image.dtype == np.float32 else as_numbers("The image", image)
     if light.ndim != 3 or light.shape[2] != 3 or not light.size:
         raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
@@ -55,7 +56,7 @@ def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArr
 
 
 def srgb_bytes(light: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the sRGB bytes of linear light of any shape, clipped to 0..1."""
+    """Return the sRGB bytes of linear light. Light is clipped to the range from 0 to 1."""
     if not np.isfinite(light).all():
         raise InputError("The image has values that are not finite; check how it was computed.")
     light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))
@@ -68,7 +69,8 @@ def srgb_bytes(light: NDArray[Any]) -> NDArray[np.uint8]:
 
 @cache
 def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """Return the least light of each byte after 0, (256,), and the byte at the start of each interval (STEPS + 1,)."""
+    """Return the least light of each byte value (256,), and the byte value at the start of each interval
+    (STEPS + 1,)."""
     middles = (np.arange(1, 257) - 0.5) / 255.0
     exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
     rounded = exact.astype(dtype)
@@ -82,8 +84,8 @@ def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def png(image: ArrayLike) -> bytes:
-    """Return an 8-bit sRGB PNG file of a linear image (rows, columns, 3), clipped to 0..1; raise errors of `to_srgb`
-    and `check_light`."""
+    """Return an 8-bit sRGB PNG file of a linear image (rows, columns, 3). Light is clipped to the range from 0 to 1.
+    Raises the same errors as `to_srgb` and `check_light`."""
     from PIL import Image
 
     pixels, content = to_srgb(image), BytesIO()
@@ -93,28 +95,28 @@ def png(image: ArrayLike) -> bytes:
 
 
 class ShadedPicture(np.ndarray):
-    """A linear picture (rows, columns, 3) from 0 to 1: a NumPy array that notebooks show as a picture, and that
-    `cortado.pictures.write_picture` saves."""
+    """A linear picture (rows, columns, 3) with values from 0 to 1. It is a NumPy array that notebooks show as a
+    picture. Use `cortado.pictures.write_picture` to save it."""
 
     @classmethod
     def of(cls, image: ArrayLike) -> Self:
         return np.asarray(image).view(cls)
 
     def _repr_png_(self) -> bytes | None:
-        """Return PNG bytes; None for a part of another shape, such as one row."""
+        """Return the picture as PNG bytes, or None if the array has not the shape of a picture."""
         return png(self) if self.ndim == 3 and self.shape[2] == 3 else None
 
 
 VIDEO_QUALITY = "18"
 BITS = 1.2e6
 THREADS = 8
-"""Number of encoder threads; the file's bytes depend on this number."""
+"""Number of encoder threads. The bytes of a file depend on this number."""
 HELPERS = 4
 TICKS = 90_000
 
 
 class Video:
-    """A video file to which frames are added; see `writing`."""
+    """A video file to which frames are added. Use `writing` to open one."""
 
     def __init__(self, container: Any, frames_per_second: float):
         from av.video.reformatter import VideoReformatter
@@ -126,7 +128,8 @@ class Video:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame shown from a time [s] on; an odd last row or column is repeated."""
+        """Add a frame that is shown from ``time`` [s] on. An odd number of rows or columns is made even by repeating
+        the last one."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)
@@ -147,7 +150,7 @@ class Video:
             self.frames += 1
 
     def copy(self, other: Any) -> None:
-        """Copy the frames of an open video of this class, before others are added."""
+        """Copy the frames of an open video. Call this before adding frames."""
         from av.bitstream import BitStreamFilterContext
 
         source = other.streams.video[0]
@@ -164,7 +167,7 @@ class Video:
             self._container.mux(self._stream.encode())
 
     def _stream_of(self, width: int, height: int) -> Any:
-        """Return the stream; no frame depends on a later one, so that new frames can follow copies."""
+        """Return the video stream. No frame depends on a later frame, so that frames can be added to a copy."""
         if self._stream is None:
             most = BITS * (width * height / (1920 * 1080)) ** 0.75
             options = {"crf": VIDEO_QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
@@ -181,16 +184,16 @@ class Video:
 
 @contextmanager
 def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
-    """Open a video for writing; it appears under its path when the block ends.
+    """Open a video for writing. The file appears under its path at the end of the ``with`` block.
 
-    After an interruption the file contains the frames so far, and the next call with equal ``note`` and ``count``
-    begins with these.
+    After an interruption the file contains the finished frames. The next call with the same ``note`` and ``count``
+    continues after the finished frames.
 
     Args:
         path: ends in .mp4.
-        frames_per_second: approximate rate; each frame has its time.
+        frames_per_second: approximate rate; each frame has its own time.
         note: text that identifies the content; it is stored in the file.
-        count: number of frames that the video will have.
+        count: number of frames of the complete video.
 
     Raises:
         InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
@@ -225,7 +228,8 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
 
 
 def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second: float = 25.0) -> Path:
-    """Write a video of linear images (rows, columns, 3) of one size, and return its path; raise errors of `writing`."""
+    """Write a video of linear images (rows, columns, 3), and return its path. All images must have the same size.
+    Raises the same errors as `writing`."""
     with writing(path, frames_per_second) as video:
         for k, frame in enumerate(frames):
             video.add(frame, k / frames_per_second)
@@ -274,13 +278,13 @@ class Animation:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a linear image (rows, columns, 3) shown from a time [s] on."""
+        """Add a linear image (rows, columns, 3) that is shown from ``time`` [s] on."""
         self._images.append(to_srgb(image))
         self._times.append(time)
         self.frames += 1
 
     def encoded(self) -> bytes:
-        """Return the WebP file, which loops for ever."""
+        """Return the WebP file, which loops forever."""
         from PIL import Image
 
         first, *others = [Image.fromarray(pixels) for pixels in self._images]
@@ -293,8 +297,8 @@ class Animation:
 
 @contextmanager
 def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[Video | Animation]:
-    """Open a film for writing: an animated WebP for a path in .webp, else a video of `writing`. An animation is written
-    when the block ends, or after an interruption with the frames so far."""
+    """Open a film for writing. The film is an animated WebP if the path ends in .webp, or else a video. An animation is
+    written at the end of the ``with`` block, even after an interruption."""
     if path.suffix.lower() != ".webp":
         with writing(path, frames_per_second, note, count) as video:
             yield video

@@ -1,8 +1,8 @@
 """Messages on stdout and stderr, progress of long computations, and handling of signals.
 
 Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect. Outside `keeping` a signal ends
-the process at once, because an exception could get lost in some library's import. Within `keeping` a signal raises a
-`KeyboardInterrupt`, so that files are closed.
+the process at once, because a library could swallow an exception. Inside `keeping` a signal raises `KeyboardInterrupt`,
+so that files are closed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cortado.errors import ComputationError
 
 
 def printable(text: str) -> str:
-    """Return a text on one line, with control characters and bytes that are not UTF-8 as escapes, such as ``\\x1b``."""
+    r"""Return a text on one line. Control characters and invalid UTF-8 bytes are escaped, such as ``\x1b``."""
     return "".join(letter if letter.isprintable() else _escape(letter) for letter in text)
 
 
@@ -32,14 +32,14 @@ def say(sentence: str, end: str = "\n") -> None:
 
 
 def note(sentence: str, end: str = "\n") -> None:
-    """Print a line about the present work on stderr, unless `quietly`."""
+    """Print a progress message on stderr, except inside `quietly`."""
     if not is_quiet():
         say(sentence, end)
 
 
 @contextmanager
 def timed_note(what: str) -> Iterator[None]:
-    """Print on stderr what the block does, and then its computing time, unless `quietly`."""
+    """Print ``what`` on stderr, and then the computing time of the block, except inside `quietly`."""
     begun = time.monotonic()
     note(what, end="")
     try:
@@ -56,7 +56,7 @@ def is_quiet() -> bool:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Suppress the output of the block, in all threads, except results, warnings and errors."""
+    """Suppress the output of all threads, except results, warnings and errors."""
     _Quiet.depth += 1
     try:
         yield
@@ -75,7 +75,8 @@ def tell(result: str) -> None:
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """Raise `ComputationError` if a print in the block fails, and `BrokenPipeError` if the reader has gone."""
+    """Convert errors of printing: a closed pipe raises `BrokenPipeError`, and any other error raises
+    `ComputationError`."""
     try:
         try:
             yield
@@ -90,8 +91,8 @@ def to_stdout() -> Iterator[None]:
 
 
 def steady_streams() -> None:
-    """Make stdout and stderr usable: closed streams discard their input, characters that the terminal lacks are
-    escaped, and errors of stderr are ignored. A result written to a closed stdout still fails."""
+    """Make stdout and stderr usable. Closed streams are replaced by the null device, characters that the terminal lacks
+    are escaped, and errors of stderr are ignored. Writing a result to a closed stdout still fails."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             _point_nowhere(number, os.O_RDONLY if number == 1 else os.O_RDWR)
@@ -134,14 +135,15 @@ def announce(result: str) -> None:
 
 
 Advance = Callable[..., None]
-"""Reports ``n`` more steps as done, by default one, with values to show, such as ``loss=0.1``."""
+"""A function that reports ``n`` finished steps, by default one step. It also takes values to show, such as
+``loss=0.1``."""
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
 @contextmanager
 def untracked() -> Iterator[None]:
-    """Hide the progress of the block's computations in this thread, which are parts of a larger computation."""
+    """Hide the progress of parts of a larger computation."""
     token = _hidden.set(True)
     try:
         yield
@@ -153,8 +155,8 @@ def untracked() -> Iterator[None]:
 def track(
     total: int, description: str, *, stream: TextIO | None = None, interval: float | None = None
 ) -> Iterator[Advance]:
-    """Show the progress of ``total`` steps, by default on stderr: as a bar on a terminal, else as a line every
-    ``interval`` seconds. Use: ``with track(120, "optimise") as advance: ...; advance(loss=loss)``."""
+    """Show the progress of ``total`` steps, by default on stderr. A terminal shows a bar, and other streams get a line
+    every ``interval`` seconds. Example: ``with track(120, "optimise") as advance: advance(loss=loss)``."""
     stream = sys.stderr if stream is None else stream
     if _hidden.get() or is_quiet():
         yield lambda n=1, **fields: None
@@ -188,8 +190,8 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
 
 
 class _Lines:
-    """Progress in lines. The time left is estimated from steps after the first report, as kernels are compiled
-    before."""
+    """Progress as lines of text. The estimate of the remaining time ignores the time for compiling kernels before the
+    first report."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
@@ -222,14 +224,14 @@ def _text(fields: dict[str, Any]) -> str:
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN = 0.01
-"""Delay [s] before an interruption is raised again, if Python dropped its exception, as in a finaliser."""
+"""Delay before an interruption is raised again [s], in case Python ignored the exception."""
 
 _stderr = 2
-"""Descriptor of a copy of stderr, which is silenced while Warp starts."""
+"""File descriptor of a copy of stderr."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """The exception for a signal that interrupts a command; ``kept`` is a text about what remains."""
+    """The exception for a signal that interrupts a command. ``kept`` describes the results that remain."""
 
     def __init__(self, number: int, kept: str = ""):
         super().__init__(number, kept)
@@ -241,7 +243,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def leave_at_once() -> None:
-    """End the process at once on signals from now on; ignored signals stay ignored (nohup, background jobs)."""
+    """End the process at once on later signals. Ignored signals remain ignored, as with nohup."""
     global _stderr
     with suppress(OSError):  # it may be closed
         _stderr = os.dup(2)
@@ -258,8 +260,8 @@ def finish() -> None:
 
 @contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """Turn signals in the block into exceptions. ``kept`` returns the end of their message, which tells what is kept
-    and where, or an empty text. In nested blocks the innermost non-empty text counts."""
+    """Turn signals into exceptions during the ``with`` block. ``kept`` returns the end of the exception's message,
+    which names the saved results. In nested blocks the innermost non-empty text is used."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _raise)
@@ -275,7 +277,8 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 
 class Hold:
-    """A temporary delay of signals. Threads and processes started meanwhile never receive the Ctrl-C of a terminal."""
+    """A temporary delay of signals. Threads and processes that start during the delay never receive the Ctrl-C of a
+    terminal."""
 
     def __init__(self) -> None:
         self._late: list[int] = []
@@ -289,7 +292,7 @@ class Hold:
             self._handler = signal.signal(signal.SIGTERM, lambda number, _: self._late.append(number))
 
     def end(self) -> None:
-        """Deliver the delayed signals; repeated calls do nothing."""
+        """Deliver the delayed signals. Later calls do nothing."""
         if self._handler is not None:
             signal.signal(signal.SIGTERM, self._handler)
             self._handler = None
@@ -302,7 +305,7 @@ class Hold:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Delay signals in the block, so that files are written completely."""
+    """Delay signals during the ``with`` block, so that files are written completely."""
     late, before = list[int](), dict[int, Any]()
     if threading.current_thread() is threading.main_thread():
         heard = [number for number in SIGNALS if callable(signal.getsignal(number))]
@@ -317,7 +320,8 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """Return the end of an interruption's message, or of an earlier interruption that was being handled."""
+    """Return the end of an interruption's message. If the interruption occurred while an earlier one was handled, the
+    earlier message counts."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

@@ -1,14 +1,13 @@
-"""Frames of particles in one temporal VTKHDF file, which ParaView opens and a killed run leaves readable.
+"""Write frames of particles to one temporal VTKHDF file for ParaView. The file remains readable if the run is killed.
 
-The file has room for every frame from the start. Every dataset is contiguous, sparse on disk and at a fixed offset;
-`PointOffsets` maps a frame to its rows. Datasets that count points and cells have two parts, one with all particles and
-an empty one, to which missing frames refer; one number in `PartOffsets` makes a frame appear, so that readers such as
-ParaView never see sizes change.
+The file has room for every frame from the beginning. Every dataset is contiguous, sparse on disk and at a fixed offset.
+`PointOffsets` maps a frame to its data. Datasets that count points and cells have two parts: one for all particles, and
+an empty part for missing frames. A number in `PartOffsets` makes a frame appear, so that readers never see a size
+change.
 
-HDF5 only creates the file in memory, and plain writes copy it to disk and write frames at the offsets of their
-datasets, because HDF5 crashes on a full disk (HDF5 2.0). Then one write of eight bytes stores the number of frames and
-their CRC-32. HDF5's checksums and its mode for one writer and many readers are not used: a killed process leaves the
-index of chunks half written, and VTK cannot open the file.
+HDF5 only creates the file in memory, because it crashes on a full disk (HDF5 2.0). Plain writes copy the file to disk
+and add frames. One write of eight bytes then stores the number of frames and their CRC-32. HDF5's checksums and its
+mode for one writer and many readers are not used, because VTK cannot open their files after a killed process.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
 """
@@ -33,9 +32,8 @@ from cortado.errors import ComputationError, InputError
 from cortado.files.disk import sentences, unfinished, write_fully
 
 FORMAT = 3
-"""Version of the group "cortado"; version 1 had no checksums, version 2 no states to continue from."""
-WRITTEN, MISSING = 0, 1
-"""Numbers of the part for a written frame and of the part for a missing frame."""
+"""Version of the file's group "cortado"."""
+WRITTEN, MISSING = 0, 1  # parts of frames
 _TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
 _PAGE = 4096
 Arrays = Mapping[str, NDArray[Any]]
@@ -45,22 +43,22 @@ Kinds = Mapping[str, tuple[np.dtype[Any], tuple[int, ...]]]
 @dataclass(frozen=True)
 class FileLayout:
     times: NDArray[np.float64]
-    """(frames,) expected times [s]"""
+    """Expected times of the frames (frames,) [s]."""
     particles: int
     dimension: int
-    """2 or 3; in 2-D the stored z is 0"""
+    """Dimension, 2 or 3. In 2-D the stored z is 0."""
     precision: str = "float32"
-    """"float32" or "float64": type of positions, velocities and scalars"""
+    """Type of positions, velocities and scalars: "float32" or "float64"."""
     steps: int = 0
     scalars: Sequence[str] = ()
     vectors: Sequence[str] = ()
     others: Arrays = field(default_factory=dict)
-    """further arrays of every frame by name, with the types and shapes of the first frame"""
+    """Additional arrays of every frame by name, with the types and shapes of the first frame."""
     constants: Arrays = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     origin: str = ""
     marks: tuple[float, ...] = ()
-    """time of the first frame [s] and frames per second [1/s]; empty if frames are chosen by steps"""
+    """Time of the first frame [s] and frames per second [1/s]. Empty if frames are chosen by number of steps."""
 
     def __post_init__(self) -> None:
         own: dict[str, Any] = {"times": np.array(self.times, dtype=np.float64, ndmin=1)}
@@ -86,7 +84,7 @@ class FileLayout:
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of a row of each dataset with n rows a frame, by name, in the order of their checksum."""
+        """Shape of each dataset's entries by name, in the order of the checksum."""
         fields: dict[str, tuple[int, ...]] = dict.fromkeys(("velocity", *self.vectors), (3,))
         fields |= dict.fromkeys(self.scalars, ())
         return {"VTKHDF/Points": (3,)} | {f"VTKHDF/PointData/{name}": fields[name] for name in sorted(fields)}
@@ -110,7 +108,7 @@ class FileLayout:
         return len(self.times) * frame + self.steps * self.records.itemsize + 8 * 2 * self.particles + constants
 
     def create(self) -> tuple[Pages, dict[str, int]]:
-        """Return the empty file, and the byte offset of each dataset."""
+        """Return the empty file and the byte offset of each dataset."""
         import h5py
 
         pages = Pages()
@@ -170,7 +168,8 @@ class FileLayout:
 
 
 def frames_seed(shape: tuple[int, int], kinds: Kinds, constants: Arrays, origin: str, marks: tuple[float, ...]) -> int:
-    """Return the checksum of no frames, which depends on ``kinds``, type and shape of each field, and on constants."""
+    """Return the initial checksum, before any frame. It depends on the types and shapes of the fields and on the
+    constants."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
@@ -204,7 +203,7 @@ class Pages(io.RawIOBase):
         self._place = self._end = 0
 
     def save(self, file: Any) -> None:
-        """Write the pages to an open file on disk, which stays sparse."""
+        """Write the pages to an open file on disk. The file remains sparse."""
         file.truncate(self._end)
         for number, page in sorted(self._pages.items()):
             file.seek(number * _PAGE)
@@ -233,7 +232,6 @@ class Pages(io.RawIOBase):
         return len(buffer)
 
     def _parts(self, content: Any) -> Iterator[tuple[bytearray, int, memoryview]]:
-        """Yield each page with an offset in it and the part of the content that belongs there; advance the position."""
         rest = memoryview(content)
         while rest:
             number, place = divmod(self._place, _PAGE)
@@ -243,13 +241,13 @@ class Pages(io.RawIOBase):
 
 
 class TrajectoryWriter:
-    """Writes frames to one VTKHDF file; a context manager. The file appears at ``path`` when its first ``kept`` frames
-    are written, and can be opened while it grows. Missing frames contain no particles."""
+    """A context manager that writes frames to one VTKHDF file. The file appears at ``path`` after its first ``kept``
+    frames, and can be opened while it grows. Missing frames contain no particles."""
 
     def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
-        """Create the file; ``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames,
-        by default for all. Raise `InputError` for impossible sizes or paths, and `ComputationError` if the disk lacks
-        room."""
+        """Create the file. ``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames,
+        by default for all frames. Raises `InputError` for impossible sizes or paths, and `ComputationError` if the disk
+        is too full."""
         self.path, self._layout = Path(path), FileLayout(**fields)
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)
@@ -274,10 +272,10 @@ class TrajectoryWriter:
         others: Mapping[str, ArrayLike] | None = None,
         **scalars: ArrayLike,
     ) -> None:
-        """Write one frame: positions (n, d) [m], velocities (n, d) [m/s], and exactly the fields named at construction.
-        ``step`` is the number of steps so far, by default of frames; ``time`` [s] replaces the announced one. Raise
-        `InputError` for other shapes or names or for too many frames, and `ComputationError` if the disk is full;
-        earlier frames stay readable."""
+        """Write one frame: positions (n, d) [m], velocities (n, d) [m/s], and the fields named at construction.
+        ``step`` is the number of steps so far, by default the number of frames. ``time`` [s] replaces the expected
+        time. Raises `InputError` for wrong shapes or names and for too many frames, and `ComputationError` if the disk
+        is full. Earlier frames remain readable."""
         frame, frames = self.frames_written, len(self._layout.times)
         if frame >= frames:
             raise InputError(f"{self.path} has room for {frames} frames, but one more was given.")
@@ -311,8 +309,8 @@ class TrajectoryWriter:
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
     def append_steps(self, **diagnostics: ArrayLike) -> None:
-        """Write the diagnostics, by name, of one step (scalars) or of k steps (arrays (k,)); raise errors as `append`
-        does."""
+        """Write the diagnostics of one step (scalars) or of k steps (arrays (k,)), by name. Raises the same errors as
+        `append`."""
         kinds = self._layout.diagnostics
         if set(diagnostics) != set(kinds):
             raise InputError(f"Expected the diagnostics {sorted(kinds)}, found {sorted(diagnostics)}.")
@@ -328,7 +326,7 @@ class TrajectoryWriter:
         self.steps_written, self._steps_checksum = last, checksum
 
     def close(self) -> None:
-        """Finish the file; remove it if not all ``kept`` frames were written."""
+        """Finish the file. A file with fewer than ``kept`` frames is removed."""
         self._file.close()
         if self.frames_written < self._kept:
             self._unfinished.unlink(missing_ok=True)
@@ -360,7 +358,7 @@ class TrajectoryWriter:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Read the completed frames and steps, also while the writer is running or after it was killed.
+    """Read the complete frames and steps, also during a run and after a killed run.
 
     Returns:
         times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s], and every
@@ -368,7 +366,7 @@ def read(path: str | Path) -> dict[str, Any]:
         diagnostics (steps,). Also origin, a text, and marks, None or two numbers.
 
     Raises:
-        InputError: the file is missing, damaged, or none of Cortado's trajectories.
+        InputError: the file is missing, damaged, or not a trajectory of Cortado.
     """
     import h5py
 

@@ -1,10 +1,11 @@
-"""Gradient estimators for `Problem.value_and_gradient`; each class states its formula, bias and cost.
+"""Gradient estimators for `Problem.value_and_gradient`. Each class states its formula, bias and cost.
 
-`Exact` computes the derivative of the discrete step by hand-written adjoints, `Tape` by Warp's automatic
-differentiation. Beyond the predictability horizon neighbouring trajectories diverge, and this derivative is of little
-use. `AdjointViscosity` damps the adjoint. `EnsembleMean` averages such gradients over an ensemble; `Guided` also
-corrects their size by differences of the loss. `RandomizedSmoothing` needs forward runs only; the others are compared
-with it.
+`Exact` computes the derivative of the discrete step by hand-written adjoints, and `Tape` by Warp's automatic
+differentiation. Beyond the predictability horizon neighbouring trajectories diverge, and the exact derivative is of
+little use. `AdjointViscosity` damps the adjoint instead.
+
+`EnsembleMean` averages gradients over an ensemble. `Guided` also corrects the size of the gradients by differences of
+the loss. `RandomizedSmoothing` needs only forward runs, and is the reference for all estimators.
 """
 
 from cortado.arrays import require_function, require_methods
@@ -50,9 +51,8 @@ def estimate(
 ) -> Estimate:
     """Return the loss of a problem and its gradient by an estimator, `Exact` by default.
 
-    Raises `InputError` if ``gradient`` is no estimator, or does not return the gradient of every parameter.
-
-    ``parameters`` are values by name; ``observe`` is called with the number and the adjoint of each state.
+    ``parameters`` are values by name. ``observe`` is called with the number and the adjoint of each state. Raises
+    `InputError` if ``estimator`` is not an estimator, or if its result lacks the gradient of a parameter.
 
     Example::
 

@@ -1,4 +1,4 @@
-"""Estimators that average over an ensemble of parameters and first states."""
+"""Estimators that average over an ensemble of parameters and initial states."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,23 +31,23 @@ _RUN = 1000.0
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The settings of a random ensemble around given parameters: its width and its number of samples.
+    """The settings of a random ensemble around given parameters.
 
-    The parameters, N numbers in all, are drawn from a ball of radius sqrt(N) in units of their spreads. A normal random
-    number is added to every coordinate of the first positions. Samples come in antithetic pairs and are equal at every
-    call.
+    The N components of all parameters, divided by their spreads, are drawn from a ball of radius sqrt(N). A normal
+    random number is added to every coordinate of the initial positions. Samples come in antithetic pairs and are the
+    same in every call.
     """
 
     spread: float | Mapping[str, float] = 0.5
-    """Width of the ensemble in each parameter, in the parameter's units: one number, or a table by name. The width is
-    sqrt((N + 2) / N) times a component's standard deviation."""
+    """Width of the ensemble in each parameter, in the unit of the parameter: one number, or a table by name. The width
+    is sqrt((N + 2) / N) times the standard deviation of a component, where N is the number of components."""
     samples: int = 8
-    """Number of samples, at most 100,000; memory holds all results until they are averaged."""
+    """Number of samples, at most 100,000. All results are held in memory."""
     position_noise: float = 0.01
-    """Standard deviation of the perturbations of first positions [spacings]; 0 for none."""
+    """Standard deviation of the perturbations of initial positions [spacings]."""
     seed: int = 0
     executor: Executor = field(default=InProcess(), compare=False, repr=False, kw_only=True)
-    """Executor that computes the members of the ensemble; the result has the same bits with every executor."""
+    """Executor that computes the members of the ensemble. The results of all executors are bitwise equal."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.samples) or self.samples < 2:
@@ -66,8 +66,8 @@ class Ensemble:
         keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
-        """Return the ensemble around the parameters of a problem; each ``draw`` has independent samples. Raise
-        `InputError` for a batch, without parameters, and for spreads smaller than round-off."""
+        """Return the ensemble around the parameters of a problem. Each ``draw`` has independent samples. Raises
+        `InputError` for a batch, for no parameters, and for spreads below round-off."""
         if problem.simulation.batch is not None:
             raise InputError(
                 f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
@@ -89,12 +89,12 @@ class Ensemble:
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
-        """Return estimates at points, in order; ``observe`` needs the states and keeps the runs in this process."""
+        """Return the estimates at the points. With ``observe`` all runs are computed in this process."""
         executor = self.executor if observe is None else InProcess()
         return evaluated(problem, points, executor, observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
-        """Raise `InputError` unless memory suffices for the results of ``runs`` runs with ``numbers`` numbers each."""
+        """Raise `InputError` unless the memory suffices for ``runs`` results with ``numbers`` components each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
     def _spread(self, name: str) -> float:
@@ -107,60 +107,57 @@ class Ensemble:
 class Sampler:
     values: Arrays
     spreads: np.ndarray
-    """(numbers,) spread of every component of the values"""
+    """Spread of each component of the parameters (numbers,)."""
     start: np.ndarray
-    """(n, d) first positions [m]"""
+    """Initial positions (n, d) [m]."""
     position_noise: float
-    """Standard deviation of the perturbations of first positions [m]."""
+    """Standard deviation of the perturbations of initial positions [m]."""
     random: np.random.Generator
 
     def rotation(self) -> np.ndarray:
-        """Return a random orthonormal basis (numbers, numbers), uniform over all rotations, as rows."""
+        """Return a random orthonormal basis (numbers, numbers), uniformly distributed over all rotations."""
         q, r = np.linalg.qr(self.random.standard_normal((len(self.spreads), len(self.spreads))))
         return (q * np.sign(np.diag(r))).T
 
     def offset(self) -> np.ndarray:
-        """Return a random point (numbers,), uniform in the ball, in units of the spreads."""
         direction, numbers = self.random.standard_normal(len(self.spreads)), len(self.spreads)
         radius = np.sqrt(numbers) * self.random.random() ** (1.0 / numbers)
         return radius / np.linalg.norm(direction) * direction
 
     def displacement(self) -> np.ndarray:
-        """Return a random displacement (n, d) of the first positions [m]."""
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Point:
-        """Return a sample with parameters moved by ``u`` (numbers,), in units of the spreads, and displaced first
-        positions."""
+        """Return a sample with changed parameters and displaced initial positions. ``u`` (numbers,) is the change of
+        the parameters, in units of the spreads."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
         return Point(values, estimator, errors=NO_RUN, is_sample=True)
 
     def named(self, numbers: np.ndarray) -> Arrays:
-        """Split a vector (numbers,) into arrays by the parameters' names."""
+        """Split a vector (numbers,) into arrays by parameter name."""
         return _moved({name: np.zeros_like(value) for name, value in self.values.items()}, numbers)
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    """Return values by name plus a change, a vector (numbers,) for all values."""
     ends = np.cumsum([value.size for value in values.values()])
     parts = np.split(change, ends[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
 
 
 MOST_LEFT_OUT = 0.25
-"""Greatest share of members that an average may leave out."""
+"""Greatest fraction of failed members in an average."""
 ADVICE = "take a smaller spread, or a logarithm (cortado.optimisation.transforms)"
 
 
 class LeftOutWarning(CortadoWarning):
-    """A warning that an average uses fewer runs than the ensemble has."""
+    """A warning that an average ignores failed runs of the ensemble."""
 
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
-    """Return a mask (members,) of the members to average, without members with a failed run; ``what`` names the members
-    in the plural. Warn of members left out, or raise the first run's error if they are more than a quarter of all."""
+    """Return a mask (members,) of the members without a failed run, and warn about failed members. If more than a
+    quarter failed, raise the first run's error. ``what`` names the members in the plural."""
     errors = [getattr(one, "diverged", None) for one in runs]  # an estimator of one's own may return anything
     lost = np.array([error is not None for error in errors], dtype=bool).reshape(members, -1)
     kept = np.array([not any(member) for member in lost], dtype=bool)
@@ -180,36 +177,35 @@ def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
 
 SMOOTHING, SURROGATE = AdjointViscosity(order=2), AdjointViscosity()
 MOST_NUMBERS = 64
-"""Greatest number of components for differences; each component costs two runs per sample."""
+"""Greatest number of components for central differences. Each component costs two runs per sample."""
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Ensemble):
-    """A gradient estimator: central differences averaged over an ensemble of parameters and first states; the reference
-    for long runs.
+    """A gradient estimator: central differences averaged over an ensemble of parameters and initial states. It is the
+    reference for long runs.
 
-    Formula: for parameters u of N numbers, each in units of its spread h,
+    Formula: let u be the parameters with N components, each divided by its spread, and L the loss. The gradient is
 
         g = mean over samples of sum_k (L(u + r q_k) - L(u - r q_k)) / (2 r) q_k,   r = sqrt(N),
 
-    where q_1 ... q_N is an orthonormal basis, rotated at random in every sample. Both sides of a difference have the
-    same perturbed first positions. g is the gradient of the loss averaged over the ball of an `Ensemble`, of radius h
-    sqrt(N) (randomised smoothing with antithetic, orthogonal directions).
+    where q_1 ... q_N is an orthonormal basis, rotated at random in every sample. The two losses of a difference have
+    the same perturbed initial positions. g is the gradient of the loss averaged over the ball of an `Ensemble`.
 
     Bias: the average removes features of the loss narrower than the spread, as intended. Noise: the ``standard_error``
     of the `Estimate`. Cost: 2 N forward runs per sample, so N should be a few dozen at most.
 
-    Runs that diverge: their differences are left out, up to a quarter of all, and the sum over a sample's other
-    differences is scaled up. The scaling adds no bias if all directions diverge equally often.
+    Runs that diverge: their differences are left out, up to a quarter of all differences. The sum over the remaining
+    differences of the sample is scaled up. The scaling adds no bias if all directions diverge equally often.
 
-    ``position_noise``: how far first positions are moved, in spacings; ``seed`` of the random numbers; ``executor``:
-    where the members run.
+    ``position_noise`` is the standard deviation of the displacements of initial positions, in spacings. ``seed`` is the
+    seed of the random numbers. ``executor`` computes the runs.
 
     Example: ``estimate = problem.estimate(parameters, cortado.gradients.RandomizedSmoothing(0.5))``
     """
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its smoothed gradient; ``observe`` is not called, because there are no adjoints."""
+        """Return the loss and its smoothed gradient. ``observe`` is not called, because there are no adjoints."""
         ensemble = self.around(problem, parameters)
         numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
@@ -244,26 +240,28 @@ class RandomizedSmoothing(Ensemble):
 
 @dataclass(frozen=True)
 class EnsembleMean(Ensemble):
-    """A gradient estimator: the mean of another estimator's gradients over an ensemble of parameters and first states.
+    """A gradient estimator: the mean gradient of a given estimator over an ensemble of parameters and initial states.
 
-    Formula: g = mean of the estimator's gradient over points of the ensemble. If the estimator is accurate, g is the
-    gradient of `RandomizedSmoothing`, at a cost that does not depend on the number of parameters. For long runs, do not
-    average `Exact` gradients: the largest few dominate the mean.
+    Formula: g is the mean of the estimator's gradient over the points of the ensemble. If the estimator is accurate, g
+    is the gradient of `RandomizedSmoothing`, but the cost does not depend on the number of parameters. For long runs,
+    do not average `Exact` gradients, because the largest few dominate the mean.
 
-    Bias: the estimator's bias, and the effect of the perturbed first positions if the loss is as small as this effect.
-    Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients of the estimator and one forward run.
+    Bias: the estimator's bias. The perturbations of the initial positions add a bias if the loss is as small as their
+    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients of the estimator and one
+    forward run.
 
-    Samples that diverge: the whole antithetic pair is left out, up to a quarter of all pairs. The remaining samples
-    stay symmetric about the parameters; half a pair would shift the mean.
+    Samples that diverge: the whole antithetic pair is left out, up to a quarter of all pairs. The remaining samples are
+    symmetric about the parameters, so that the mean is not shifted.
 
-    ``spread``: by name or for all, how far parameters are moved, in their units; ``position_noise``: how far first
-    positions are, in spacings; ``seed`` of the random numbers; ``executor``: where the members run.
+    ``spread`` is the width of the ensemble in the units of the parameters, for all parameters or by name.
+    ``position_noise`` is the standard deviation of the displacements of initial positions, in spacings. ``seed`` is the
+    seed of the random numbers. ``executor`` computes the runs.
 
     Example: ``estimate = problem.estimate(parameters, cortado.gradients.EnsembleMean(0.5, samples=8))``
     """
 
     samples: int = 4
-    """Number of samples, even because samples come in antithetic pairs."""
+    """Number of samples, which must be even, because samples come in antithetic pairs."""
     estimator: GradientEstimator = SMOOTHING
 
     def __post_init__(self) -> None:
@@ -272,7 +270,7 @@ class EnsembleMean(Ensemble):
         checked_estimator(self.estimator)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and the mean gradient; ``observe`` is called with the adjoints of each sample."""
+        """Return the loss and the mean gradient. ``observe`` is called with the adjoints of each sample."""
         ensemble = self.around(problem, parameters)
         displaced = ensemble.start.size if self.position_noise else 0
         self.require_memory(self.samples, 2 * len(ensemble.spreads) + displaced)
@@ -293,20 +291,20 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the average (numbers,) of gradients (samples, numbers) and its standard error; antithetic pairs are
-        adjacent rows."""
+        """Return the mean gradient (numbers,) and its standard error, given gradients (samples, numbers). Antithetic
+        pairs are adjacent."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
 def require_pairs(samples: int) -> None:
-    """Raise `InputError` unless there are at least two antithetic pairs, which a standard error needs."""
+    """Raise `InputError` unless there are at least two antithetic pairs of samples."""
     if samples % 2 or samples < 4:
         raise InputError(f"samples is {shown(samples)}, but must be an even number of at least 4.")
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the rows and its standard error, without overflow of squares; NaN for columns with an infinite
-    number."""
+    """Return the mean of the samples and its standard error, without overflow. Components with infinite numbers give
+    NaN."""
     size = np.abs(samples).max(initial=0.0)
     unit = size if 0.0 < size < np.inf else 1.0
     with np.errstate(invalid="ignore"):
@@ -320,37 +318,38 @@ def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Guided(Ensemble):
-    """A gradient estimator: the mean of a surrogate's gradients over an ensemble, each of its parts scaled by
+    """A gradient estimator: the mean gradient of a surrogate estimator over an ensemble, with each part scaled by
     differences of the loss.
 
-    Formula: the mean of the surrogate's gradients, in units of the spreads, is cut into equal parts along the first
-    axis of each parameter (steps or knots). Scaled to length 1, the parts are directions p_1 ... p_K, and
+    Formula: the mean of the surrogate's gradients, in units of the spreads, is divided into equal parts along the first
+    axis of each parameter (steps or knots). Let p_1 ... p_K be the parts, scaled to length 1. The gradient is
 
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
-    where N_k is the number of non-zero numbers of part k. Both sides of a difference have the same perturbed first
-    positions. So g projects the smoothed gradient onto the span of the parts (guided evolution strategies,
-    Maheswaranathan et al. 2019, without their search outside the span).
+    where L is the loss, u are the parameters, and N_k is the number of non-zero components of part k. The two losses of
+    a difference have the same perturbed initial positions. So g projects the smoothed gradient onto the span of the
+    parts. Source: guided evolution strategies (Maheswaranathan et al. 2019), without their search outside the span.
 
-    Bias: directions that the surrogate's gradient lacks are missed, but the size of each part is that of the smoothed
-    loss. Noise: the ``standard_error`` combines the errors of D_k and p_k, with degrees of freedom by Welch and
+    Bias: directions outside the span of the parts are missed. The size of each part is correct for the smoothed loss.
+    Noise: the ``standard_error`` combines the errors of D_k and p_k, with degrees of freedom by Welch and
     Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences`` forward runs, for any number
     of parameters.
 
-    Runs that diverge: the surrogate's are treated as in `EnsembleMean`. A sample of the differences is left out as a
-    whole, so that all D_k average the same samples. At most a quarter may be left out, so no sample if there are fewer
-    than 4.
+    Runs that diverge: runs of the surrogate are treated as in `EnsembleMean`. A sample of the differences is left out
+    as a whole, so that all D_k average the same samples. At most a quarter of the samples may be left out, and none of
+    fewer than 4.
 
-    ``spread``: by name or for all, how far parameters are moved, in their units; ``position_noise``: how far first
-    positions are, in spacings; ``seed`` of the random numbers; ``executor``: where the members run.
+    ``spread`` is the width of the ensemble in the units of the parameters, for all parameters or by name.
+    ``position_noise`` is the standard deviation of the displacements of initial positions, in spacings. ``seed`` is the
+    seed of the random numbers. ``executor`` computes the runs.
 
     Example: ``estimate = problem.estimate(parameters, cortado.gradients.Guided(0.5, parts=4))``
     """
 
     samples: int = 4
-    """Number of gradients of the surrogate, an even one."""
+    """Number of gradients of the surrogate, which must be even."""
     parts: int = 4
-    """Number of parts of each parameter: at most its number of rows, and 1 for a vector or a number."""
+    """Number of parts of each parameter, at most the length of its first axis. A vector or a number has one part."""
     differences: int = 2
     """Number of samples of each difference."""
     surrogate: GradientEstimator = SURROGATE
@@ -365,7 +364,7 @@ class Guided(Ensemble):
         checked_estimator(self.surrogate)
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its gradient; ``observe`` is called with the adjoints of the surrogate's samples."""
+        """Return the loss and its gradient. ``observe`` is called with the adjoints of the surrogate's samples."""
         ensemble = self.around(problem, parameters, draw=1)
         surrogate = EnsembleMean(
             self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
@@ -395,8 +394,8 @@ class Guided(Ensemble):
         return Estimate(surrogate.loss, gradient, error, freedom, surrogate.mean_loss, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return directions (numbers,) of length 1, in units of the spreads, and their standard errors; each is the
-        gradient on one part of a parameter. Parts with zero gradient are left out."""
+        """Return the scaled parts of a gradient, as directions (numbers,) of length 1, and their standard errors. Parts
+        with zero gradient are left out."""
         places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
         firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
         places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
@@ -417,12 +416,13 @@ class Guided(Ensemble):
 
 
 def _places(value: np.ndarray, parts: int) -> np.ndarray:
-    """Return for each number of a parameter (size,) the part to which its row belongs; 0 for a vector or a number."""
+    """Return the number of the part for each component of a parameter (size,). It is 0 for a vector or a number."""
     rows = len(value) if value.ndim > 1 else 1
     return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
 
 
 def _freedom(errors: np.ndarray, freedoms: tuple[float, float]) -> float:
-    """Return the degrees of freedom of the sum of two errors (2, numbers), given those of each (Welch 1947)."""
+    """Return the degrees of freedom of the sum of two errors (2, numbers) with given degrees of freedom (Welch
+    1947)."""
     shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
     return float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))

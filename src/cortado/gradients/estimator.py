@@ -20,31 +20,32 @@ from cortado.solvers.solver import Counts
 
 @dataclass(frozen=True)
 class Estimate:
-    """A loss and its gradient, with standard errors and other accuracy figures if the estimator has them."""
+    """A loss and its gradient, with standard errors if the gradient is an average."""
 
     loss: Any
-    """Loss: a float, or an array (batch,) for a batch."""
+    """Loss, as a float, or as an array (batch,) for a batch."""
     gradient: Arrays
     standard_error: Arrays | None = None
-    """Standard error of each component of the gradient; None if the gradient is no average over samples."""
+    """Standard error of each component of the gradient, or None if the gradient is not an average over samples."""
     degrees_of_freedom: float | None = None
-    """Number of independent samples minus one; `Guided` combines two errors."""
+    """Number of independent samples minus one. `Guided` combines the degrees of freedom of two errors."""
     mean_loss: float | None = None
-    """Mean of the loss over the ensemble of the gradient."""
+    """Mean of the loss over the ensemble."""
     left_out: int = 0
-    """Number of an ensemble's runs that the average leaves out, because they or their partners failed."""
+    """Number of runs missing from the average. They failed, or their antithetic partners failed."""
     diverged: Exception | None = None
-    """The `DivergedError` or `OutOfRangeError` of a point of `cortado.evaluate` without a result; loss and gradient are
+    """Error of a failed point of `cortado.evaluate`: a `DivergedError` or an `OutOfRangeError`. Loss and gradient are
     then NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
-        """Return the lower and the upper end, by parameter, of an interval for each component of the gradient.
+        """Return the lower and the upper end of a confidence interval for each component of the gradient, by parameter
+        name.
 
         With the probability ``confidence`` the interval contains the estimator's mean over infinitely many samples, by
         Student's t-distribution. The interval does not include the estimator's bias.
 
         Raises:
-            InputError: the estimate is no average, or the confidence is not between 0 and 1.
+            InputError: the estimate is not an average, or the confidence is not between 0 and 1.
         """
         if self.standard_error is None or self.degrees_of_freedom is None:
             raise InputError("The estimate has no confidence interval, as it is no average over samples.")
@@ -58,7 +59,7 @@ class Estimate:
         return lower, {name: value + reach * errors[name] for name, value in self.gradient.items()}
 
     def member(self, number: int, shapes: Mapping[str, tuple[int, ...]]) -> "Estimate":
-        """Return the estimate of one scene of a batch, with gradients of the given shapes."""
+        """Return the estimate of scene ``number`` of a batch, with gradients of the given shapes."""
         gradient = {name: bar[number].reshape(shapes[name]) for name, bar in self.gradient.items()}
         return replace(self, loss=float(self.loss[number]), gradient=gradient)
 
@@ -70,15 +71,15 @@ class Estimate:
 
 
 class ForwardPass(Protocol):
-    """Protocol of a forward run with its loss; backward passes can start until the problem is run again."""
+    """Protocol of a forward run and its loss. Backward passes can start from the run until the problem is run again."""
 
     @property
     def loss(self) -> float:
         """Loss of the run."""
 
     def back(self, estimator: "AdjointEstimator", observe: Observer | None = None) -> Arrays:
-        """Return the gradient by an estimator; ``observe`` is called with the number and the adjoint of every state,
-        last to first."""
+        """Return the gradient by an estimator. ``observe`` is called with the number and the adjoint of each state,
+        beginning with the last state."""
 
 
 class Differentiable(Protocol):
@@ -90,39 +91,40 @@ class Differentiable(Protocol):
         """Return the loss for given parameters."""
 
     def forward_pass(self, parameters: Values) -> ForwardPass:
-        """Run forward and return the run, from which backward passes can start."""
+        """Run forward, and return the run for backward passes."""
 
 
 @runtime_checkable
 class Batchable(Protocol):
-    """Protocol of a problem that can be evaluated at many points in one launch."""
+    """Protocol of a problem that can be evaluated at many points together."""
 
     def room(self, estimator: "AdjointEstimator | None" = None) -> int:
-        """Return how many points one call of `together` can take, for gradients by an estimator or for losses alone."""
+        """Return the greatest number of points in a call of `together`. Without an estimator only losses are
+        computed."""
 
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at points with equal parameter names and shapes, computed in one launch with the bits of
-        separate runs. Without an estimator estimates have the loss alone; a point with a lost particle returns its
-        error."""
+        """Return estimates at several points, computed in one launch. All points have the same parameter names and
+        shapes. The results are bitwise equal to separate runs. Without an estimator the estimates have only the loss. A
+        point that loses a particle returns its error."""
 
 
 class GradientEstimator(Protocol):
-    """Protocol of an object that computes a gradient, exact or approximate."""
+    """Protocol of an object that computes a gradient, exactly or approximately."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its gradient; ``observe`` is called with the adjoint of each state."""
+        """Return the loss and its gradient. ``observe`` is called with the number and the adjoint of each state."""
 
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
-    """Return the estimator; raise `InputError` for anything else, such as the class of an estimator."""
+    """Return the estimator. Raises `InputError` for any object that is not an estimator, such as a class."""
     require_methods("estimator", estimator, ("estimate",), "an object such as cortado.gradients.Exact()")
     return estimator
 
 
 def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
-    """Return the estimator; raise `InputError` unless it is an `AdjointEstimator`."""
+    """Return the estimator. Raises `InputError` unless the estimator is an `AdjointEstimator`."""
     if not isinstance(estimator, AdjointEstimator):
         wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
         raise InputError(f"estimator is {shown(estimator)}, but must be {wanted}.")
@@ -130,8 +132,8 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """Return an estimator's result in float64; raise `InputError` unless it has a gradient of every parameter in its
-    shape, for a batch with a first axis for the scenes."""
+    """Return the result of an estimator in float64. Raises `InputError` unless the result has a gradient of every
+    parameter in the right shape. In a batch the first axis of a gradient is the scene."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -148,32 +150,33 @@ def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -
 
 
 class AdjointEstimator(ABC):
-    """A base class of estimators that make one backward pass through one rollout, step by step."""
+    """A base class of estimators with one backward pass through a rollout."""
 
     @property
     def batches(self) -> bool:
-        """True if the estimator never mixes scenes of a batch; override this property to allow batches."""
+        """True if the estimator can differentiate batches. Override this property if the estimator never mixes
+        scenes."""
         return False
 
     @abstractmethod
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        """Return the backward step for one rollout."""
+        """Return the backward step for a rollout."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the loss and its gradient by a forward and a reverse pass; see `GradientEstimator`."""
+        """Return the loss and its gradient by a forward and a backward pass. See `GradientEstimator`."""
         forward_pass = problem.forward_pass(parameters)
         return Estimate(forward_pass.loss, self.back(forward_pass, observe))
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
-        """Return the gradient of a forward run's loss; see `ForwardPass.back`."""
+        """Return the gradient of a forward run's loss. See `ForwardPass.back`."""
         return forward_pass.back(self, observe)
 
 
 class Filtered:
-    """A backward step of another estimator whose adjoint is then filtered."""
+    """A backward step that also filters the adjoint. It wraps the backward step of a given estimator."""
 
     only_launches: ClassVar[bool] = False
-    """True if `filter` always launches the same kernels and nothing else; only then may a CUDA graph capture the
+    """True if `filter` always launches the same kernels and does nothing else. A CUDA graph can then capture the
     backward step."""
 
     def __init__(self, base: BackwardStep):
@@ -191,30 +194,30 @@ class Filtered:
         return self._base.parameters()
 
     def filter(self, bar: State) -> None:
-        """Change the adjoint of the state from which the last replayed step starts."""
+        """Change the adjoint of the state after a backward step."""
         raise NotImplementedError
 
 
 NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
-"""Errors that mean that a point has no result; other points are still evaluated."""
+"""Errors of a point without a result, after which the remaining points are still evaluated."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """Parameter values, and the estimator of the gradient there."""
+    """Parameter values and a gradient estimator."""
 
     values: Values
     estimator: GradientEstimator | None = None
-    """None for the loss alone."""
+    """Gradient estimator, or None to compute only the loss."""
     loss_if_diverged: float = np.nan
     errors: tuple[type[Exception], ...] = ()
-    """Errors after which the point has a substitute loss."""
+    """Errors that are replaced by a substitute loss."""
     is_sample: bool = False
-    """True for a random point of an ensemble, whose estimate is not checked, as perturbed first positions need no
-    gradient; an `InputError` says that it is a sample."""
+    """True for a random sample of an ensemble. Its estimate is not checked, and an `InputError` mentions that it is a
+    sample."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the loss at the point and its gradient, which is empty without an estimator."""
+        """Return the loss and the gradient at the point. Without an estimator the gradient is empty."""
         try:
             if self.estimator is None:
                 return Estimate(problem.value(self.values), {})
@@ -228,19 +231,18 @@ class Point:
             raise
 
     def without_a_run(self, why: Exception) -> Estimate:
-        """Return the estimate of a point whose run failed, with a gradient of NaN."""
+        """Return the estimate of a failed point, with a gradient of NaN."""
         names = self.values if self.estimator is not None else ()
         gradient = {name: np.full(np.shape(self.values[name]), np.nan) for name in names}
         return Estimate(self.loss_if_diverged, gradient, diverged=why)
 
 
 Group = tuple[Point, ...]
-"""Points that are evaluated together."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A problem as a function of groups of points; errors have the same sentences as for single points."""
+    """A function that evaluates a problem at groups of points. Error messages are the same as for single points."""
 
     problem: Differentiable
     observe: Observer | None = None
@@ -260,7 +262,8 @@ class Evaluation:
         ]
 
     def groups(self, points: Iterable[Point], threads: Callable[[], int]) -> Iterator[Group]:
-        """Yield the points in order, in groups that fit one launch and give every worker thread something to do."""
+        """Yield the points in order, in groups for one launch. The groups are small enough to keep all worker threads
+        busy."""
         for (estimator, _), alike in groupby(points, _kind):
             room = 1
             if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
@@ -276,7 +279,8 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Compute estimates at points by an executor, many in one launch, and return them in order."""
+    """Compute estimates at points with an executor, and return them in order. Many points are evaluated in one
+    launch."""
     evaluation, firsts = Evaluation(problem, observe), [0]
 
     def groups() -> Iterator[Group]:
@@ -293,12 +297,11 @@ def evaluated(
 
 
 def without_runs(errors: Sequence[Exception], of: str) -> str:
-    """Return a phrase with the number and the cause of failed runs, such as "2 of 4 points diverged"."""
+    """Return a phrase with the number and the cause of failures, such as "2 of 4 points diverged"."""
     diverged = sum(isinstance(error, DivergedError) for error in errors)
     why = ["diverged"] * bool(diverged) + ["cannot be run"] * (diverged < len(errors))
     return f"{len(errors)} of {of} {' or '.join(why)}"
 
 
 def _kind(point: Point) -> tuple[Any, ...]:
-    """Return a key, which is equal for points that one launch can evaluate."""
     return point.estimator, {name: np.shape(value) for name, value in point.values.items()}

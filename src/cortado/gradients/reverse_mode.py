@@ -20,14 +20,13 @@ from cortado.scene.parameter_values import Arrays
 from cortado.solvers.solver import Counts, Solver
 
 STRONGEST = 0.6
-"""Greatest strength s of the viscosity, which damps waves two spacings long without a change of sign."""
+"""Greatest strength of the adjoint viscosity."""
 
 
 @cache
 def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
-    """Make the kernels of `AdjointViscosity`, whose docstring has the formulas. Launch ``crowd`` and ``strength``,
-    ``sort``, which brings adjoints from the scene's order to the sorted one, and ``viscosity``. Division by S makes the
-    viscosity as strong at surfaces and in drops as inside the fluid; W(h / 2) weakens it between distant particles."""
+    """Build the kernels of `AdjointViscosity`, in the notation of its docstring. The order of launches is ``crowd``,
+    ``strength``, ``sort`` and ``viscosity``."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, per_size = pair.weight, pair.per_size
@@ -41,7 +40,6 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
 
     @fluid_sum(discretisation)
     def strain(x_ij: vector, v_ij: vector, most_i: real, most_j: real, s: neighbourhood) -> real:
-        """Return the squared strain rate gamma_i^2 as a sum over neighbours."""
         return weight(x_ij, s) / wp.max(most_i, most_j) * wp.dot(v_ij, v_ij) * per_size(x_ij, s)
 
     typed = TypesByName(real, {vector: "x a b v", neighbourhood: "s", wp.vec2d: "found squares sums"})
@@ -55,7 +53,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def crowd(s, x, most):
-        """Store max(S_i, W(h / 2))."""
+        """Store the sum of the smoothing kernel over neighbours, or a lower bound if the sum is smaller."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
@@ -65,7 +63,6 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def strength(s, coefficient: real, time_step, x, v, most, strengths):
-        """Store s_i of sorted particles."""
         i = s.first + wp.tid() // LANES
         total = strain(i, x, v, most, s)
         if lane() > 0:
@@ -82,7 +79,6 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def viscosity(s, order: wp.array(dtype=wp.int32), x, most, strengths, a_sorted, b_sorted, a, b):
-        """Apply the viscosity to two adjoint fields; results are in the scene's order."""
         i = s.first + wp.tid() // LANES
         a_total, b_total = exchange(i, x, most, strengths, a_sorted, b_sorted, s)
         if lane() > 0:
@@ -93,7 +89,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def squares(a, b, found):
-        """Store |a_i|^2 and |b_i|^2 in float64, because squares of adjoints may overflow float32."""
+        """Store the squared lengths of two vector fields in float64. The squares may overflow float32."""
         i = wp.tid()
         a_i = wp.vec3d(a[i])
         b_i = wp.vec3d(b[i])
@@ -102,8 +98,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def limit(times: wp.float64, particles: int, squares, sums, strengths, a, b):
-        """Limit a and b, given their ``squares`` by particle and the ``sums`` of these over each scene. A scene whose
-        ``strengths`` sum to 0 (no strain) is not limited."""
+        """Limit the lengths of the adjoint vectors a and b. ``sums`` has the sum of ``squares`` for each scene. A scene
+        without strain is not limited."""
         i = wp.tid()
         if strengths[i // particles] == real(0.0):
             return
@@ -133,20 +129,19 @@ class AdjointNorms:
         wp.copy(self._history, self._sum(self._squares), dest_offset=step * members, count=members)
 
     def numpy(self) -> np.ndarray:
-        """Return, for every state, the norms of the adjoints of positions and of velocities over all particles: (steps
-        + 1, 2), or (steps + 1, batch, 2) for a batch."""
+        """Return the norms of the adjoints of positions and velocities for every state, as (steps + 1, 2). A batch has
+        the shape (steps + 1, batch, 2)."""
         norms = np.sqrt(self._history.numpy())
         return norms if self._layout.batch is None else norms.reshape(-1, self._layout.batch, 2)
 
 
 @dataclass(frozen=True)
 class Exact(AdjointEstimator):
-    """A gradient estimator: the exact adjoint of the discrete step. It uses gathers without atomics, so results repeat
-    bit for bit.
+    """A gradient estimator: the exact adjoint of the discrete step. Repeated runs give the same bits.
 
-    Formula: the transposed derivative of the step. Bias: none; but if neighbouring trajectories diverge, the gradient
-    grows exponentially with the number of steps, as their distance does. Cost: every step is computed once more
-    forward, and a backward step has about twice a forward step's neighbour sums.
+    Formula: the transposed derivative of the step. Bias: none. If neighbouring trajectories diverge, the gradient grows
+    exponentially with the number of steps. Cost: every step is computed forward a second time. A backward step has
+    about twice as many neighbour sums as a forward step.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Exact())``
     """
@@ -159,10 +154,10 @@ class Exact(AdjointEstimator):
 
 @dataclass(frozen=True)
 class Tape(AdjointEstimator):
-    """A gradient estimator: the exact adjoint by Warp's own automatic differentiation of the forward kernels.
+    """A gradient estimator: the exact adjoint by Warp's automatic differentiation of the forward kernels.
 
-    It is slower than `Exact`, uses atomics on a GPU, and serves to check `Exact`. It works only with the solver
-    ``"pcisph"``; other solvers raise an error.
+    It serves as a check of `Exact`, is slower, and uses atomics on a GPU. It works only with the solver ``"pcisph"``
+    and raises an error for any other solver.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Tape())``
     """
@@ -216,32 +211,34 @@ class _TapeStep:
 class AdjointViscosity(AdjointEstimator):
     """A gradient estimator: the adjoint with an eddy viscosity that follows the strain rate of the forward flow.
 
-    Formula: after each backward step the adjoints a of positions and of velocities are blended with their averages over
-    fluid neighbours,
+    Formula: after each backward step the adjoints a_i of positions and of velocities are blended with averages over the
+    fluid neighbours j,
 
         a_i <- a_i + sum_j max(s_i, s_j) w_ij (a_j - a_i),    s_i = min(coefficient dt gamma_i, 0.6),
         gamma_i^2 = sum_j w_ij (v_i - v_j)^2 / ((x_i - x_j)^2 + 0.01 h^2),
         w_ij = W_ij / max(S_i, S_j, W(h / 2)),                S_i = sum_j W_ij.
 
-    Here x and v are positions and velocities of the state to which the adjoint belongs. The weights are symmetric and
-    sum to at most 0.6, so sum_i a_i is conserved and the norm of a does not grow.
+    Here x_i and v_i are positions and velocities of the state, W is the smoothing kernel with the support radius h, and
+    dt is the time step. s_i is the strength of the viscosity, gamma_i the strain rate, w_ij a weight, and S_i a kernel
+    sum. The weights are symmetric and sum to at most 1, and the strength is at most 0.6. The sum of a_i is therefore
+    conserved, and the norm of a does not grow.
 
-    Why: exponential growth of an adjoint happens at the scale of particles; the response to a parameter has the fluid's
-    scale. A step damps a wave of length l by about s (2 pi / l)^2 s_W^2 / 2, with s_W^2 the second moment of W. The
-    adjoint's growth rate follows the strain rate of the forward flow. So one coefficient fits all flows, and calm flow
-    is not damped.
+    Why: an adjoint grows exponentially at the scale of particles, while the response to a parameter has the scale of
+    the fluid. The viscosity damps short waves of the adjoint much more than long waves. The growth rate of the adjoint
+    follows the strain rate of the forward flow. So one coefficient fits all flows, and calm flow is not damped.
 
-    Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. Otherwise
-    a few particles' adjoints may grow faster than the viscosity spreads them, and dominate all others. Without strain
-    there is no limit.
+    Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. Without
+    this limit, the adjoints of a few particles may grow faster than the viscosity spreads them. A flow without strain
+    has no limit.
 
     Long waves are slightly damped too, which affects gradients with respect to early steps most. ``order=2``
-    extrapolates the gradients g of two coefficients to zero viscosity (Richardson): g = 2 g(C) - g(2 C).
+    extrapolates the gradients g(C) and g(2 C) of two coefficients C and 2 C to zero viscosity (Richardson): the result
+    is 2 g(C) - g(2 C).
 
     Bias: short waves of the adjoint are lost and long waves are weakened, so gradients of long runs are too small.
-    Gradients of a loss of single particles are poor, as they have no long waves. Noise: order 2 has more, so use it
-    with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with three more neighbour sums per
-    step.
+    Gradients of a loss of single particles are poor, because they have no long waves. Noise: order 2 has more noise, so
+    use it with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with three more neighbour
+    sums per step.
 
     Sources: Smagorinsky (1963) for a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) for an eddy
     viscosity of the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
@@ -251,13 +248,13 @@ class AdjointViscosity(AdjointEstimator):
     """
 
     coefficient: float = 2.0
-    """Coefficient C of the viscosity, at least 0; 0 gives `Exact`."""
+    """Coefficient of the viscosity, at least 0. With 0 the gradient is the same as that of `Exact`."""
     limit: float = 4.0
-    """Greatest length of a particle's adjoint vector, in root mean squares over all particles; infinite for no
-    limit."""
+    """Greatest length of a particle's adjoint vector, relative to the root mean square over all particles. Infinity
+    means no limit."""
     order: int = 1
-    """Order 1, or 2 for an extrapolation from two backward passes. Order 2 cannot give derivatives with respect to the
-    first state, or a single backward step."""
+    """Order 1, or 2 for an extrapolation from two backward passes. Order 2 gives no derivatives with respect to the
+    initial state, and no derivatives of a single backward step."""
 
     def __post_init__(self) -> None:
         if not is_whole(self.order) or self.order not in (1, 2):
@@ -271,15 +268,15 @@ class AdjointViscosity(AdjointEstimator):
     batches = True
 
     def derivative(self, rollout: Rollout) -> BackwardStep:
-        """Return the backward step for order 1; raise `InputError` for order 2, which takes two passes."""
+        """Return the backward step for order 1. Raises `InputError` for order 2, which has two backward passes."""
         if self.order != 1:
             raise InputError(f"order is {self.order}, but must be 1 for derivatives with respect to an earlier state.")
         step = AdjointStep(rollout)
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
-        """Return the gradient of a forward run's loss; ``observe`` is called with the adjoints of the smaller
-        coefficient."""
+        """Return the gradient of a forward run's loss. For order 2, ``observe`` is called only in the pass with the
+        smaller coefficient."""
         once = replace(self, order=1)
         gradient = forward_pass.back(once, observe)
         if self.order == 1:
@@ -289,8 +286,7 @@ class AdjointViscosity(AdjointEstimator):
 
 
 class _ViscousStep(Filtered):
-    """A backward step after which the viscosity blends adjoints of positions and velocities with averages over
-    neighbours, and limits them; ``strengths`` are s_i of sorted particles."""
+    """A backward step that smooths and limits the adjoints, as in `AdjointViscosity`."""
 
     only_launches = True
 

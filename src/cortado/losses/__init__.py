@@ -1,4 +1,4 @@
-"""Losses of a rollout: objects that compute a value and an adjoint of its last state or of states in between."""
+"""Losses of a rollout. A loss computes a value and an adjoint from one or several states."""
 
 from cortado.calls import face
 from cortado.losses.distances import (

@@ -1,4 +1,4 @@
-"""Losses: distances of particles, centre of mass, a solid, a picture, or a sensor's readings from a target."""
+"""Losses that compare particle positions, the centre of mass, a solid, a picture, or sensor readings with a target."""
 
 from functools import cache
 from hashlib import sha256
@@ -25,8 +25,7 @@ from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 @cache
 def matching_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return kernels ``squared_distance`` (in float64) and ``difference`` (times a factor) of vectors and targets,
-    which are the same for all scenes of a batch."""
+    """Return the kernels ``squared_distance``, in float64, and ``difference``, which is multiplied by a factor."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
     typed = TypesByName(real, {vector: "x target bar", wp.float64: "squares"})
@@ -49,19 +48,18 @@ def matching_kernels(precision: Precision) -> tuple[Any, Any]:
 
 @fixed
 class FinalPositions:
-    """A loss: the mean over particles of the squared distance to their targets [m2].
+    """A loss: the mean squared distance of the particles from their target positions [m2].
 
     Example: ``loss = cortado.losses.FinalPositions(trajectory[-1].positions)``
     """
 
     def __init__(self, target: np.ndarray):
-        """Set the ``target`` positions (n, d) [m], in the scene's order."""
+        """Set the ``target`` positions (n, d) [m], in the order of the initial particles."""
         self.target = read_only("target", target)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
             raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
         self.fingerprint = _checksum(self.target)
         self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}
-        """The target and the sum over particles, by device, precision and number of scenes."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FinalPositions, (self.target,)
@@ -107,13 +105,13 @@ class FinalPositions:
 
 @fixed
 class CentreOfMass:
-    """A loss: the squared distance of the centre of mass to a target [m2].
+    """A loss: the squared distance of the centre of mass from a target [m2].
 
     Example: ``problem = cortado.Problem(simulation, 100, cortado.losses.CentreOfMass([1.0, 0.2]))``
     """
 
     def __init__(self, target: Any, masses: np.ndarray | None = None):
-        """Set the ``target`` (d,) [m], and the particles' ``masses`` (n,) in any unit, None for equal masses."""
+        """Set the ``target`` (d,) [m] and the particles' ``masses`` (n,) in any unit. None means equal masses."""
         self.target, self._weights = _finite("target", target), _weights(masses)
         self.fingerprint = _checksum(self.target, self._weights)
 
@@ -139,7 +137,7 @@ class CentreOfMassAlong:
     """
 
     def __init__(self, direction: Any, masses: np.ndarray | None = None):
-        """Set the ``direction`` (d,) [-], and ``masses`` as in `CentreOfMass`."""
+        """Set the ``direction`` (d,) [-] and the particles' ``masses`` (n,) in any unit. None means equal masses."""
         self.direction, self._weights = _finite("direction", direction), _weights(masses)
         self.fingerprint = _checksum(self.direction, self._weights)
 
@@ -154,7 +152,6 @@ class CentreOfMassAlong:
 
 
 def _finite(what: str, value: Any) -> np.ndarray:
-    """Return a read-only vector in float64; raise `InputError` unless it is finite."""
     array = read_only(what, value)
     if array.ndim != 1 or not np.isfinite(array).all():
         raise InputError(f"{what} has shape {array.shape}, but must have 1 dimension and be finite.")
@@ -171,7 +168,8 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _shares(weights: np.ndarray | None, end: Snapshot, name: str, vector: np.ndarray) -> np.ndarray:
-    """Return the particles' masses (n,) divided by the total mass; raise `InputError` for an unfit vector of a loss."""
+    """Return the particles' masses divided by the total mass (n,). Raises `InputError` if the vector does not suit the
+    scene."""
     n = len(end.positions)
     if vector.shape != (end.dimension,):
         raise InputError(f"{name} has shape {vector.shape}, but must be {(end.dimension,)}.")
@@ -188,15 +186,18 @@ def _checksum(*parts: Any) -> str:
 
 @fixed
 class SolidPose:
-    """A loss of a moving solid, ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2]: the squared distance of the solid's middle
-    from a target, and, for small angles, l^2 times the squared angle to a target rotation.
+    """A loss of a moving solid: ``|x - x*|^2 + l^2 (3 - tr R*^T R)`` [m2].
+
+    x is the position of the solid's centre, R is its rotation matrix, x* and R* are the targets, and l is a length. For
+    small angles the second term is the squared angle between the rotations, times the squared length l.
 
     Example: ``loss = cortado.losses.SolidPose("raft", position=[0.8, 0.3], rotation=0.0)``
     """
 
     def __init__(self, name: str, position: Any = None, rotation: Any = None, length: float = 1.0):
-        """Set the ``name`` of the solid and at least one target: ``position`` (d,) [m] of the solid's middle, and
-        ``rotation`` [rad], a number in 2-D and a vector (3,) in 3-D. ``length`` is l [m], greater than 0."""
+        """Set the ``name`` of the solid and at least one target. ``position`` (d,) [m] is the target of the solid's
+        centre. ``rotation`` [rad] is the target angle in 2-D and a rotation vector (3,) in 3-D. ``length`` [m] is the
+        factor of angles in the loss, greater than 0."""
         if not isinstance(name, str):
             raise InputError(f"name is {shown(name)}, but must be the name of a solid.")
         if position is None and rotation is None:
@@ -238,13 +239,13 @@ class Pictures(Protocol):
         """Return the picture (rows, columns, 3) of particles."""
 
     def adjoint(self, image_bar: np.ndarray) -> Any:
-        """Return derivatives with ``positions``, ``fractions`` and ``colours``, given the adjoint of the last
-        picture."""
+        """Return derivatives with the names ``positions``, ``fractions`` and ``colours``, given the derivative with
+        respect to the last picture."""
 
 
 @fixed
 class Image:
-    """A loss: the distance of the picture of a state from a target picture.
+    """A loss: the distance between a picture of the state and a target picture.
 
     Example::
 
@@ -253,9 +254,12 @@ class Image:
     """
 
     def __init__(self, renderer: Pictures, target: np.ndarray, distance: ImageLoss | None = None):
-        """Set a ``renderer`` of `Simulation.renderer`, and the ``target`` picture (rows, columns, 3), linear RGB from 0
-        to 1. ``distance``: `cortado.image_losses.SquaredDifference`, the default, or `Pyramid` for shapes that may not
-        overlap their target. Raise `InputError` for a target of another shape, or with values up to 255."""
+        """Set a ``renderer`` from `Simulation.renderer`, and the ``target`` picture (rows, columns, 3) in linear RGB
+        from 0 to 1. ``distance`` is `cortado.image_losses.SquaredDifference`, the default, or `Pyramid` for shapes that
+        may not overlap their target.
+
+        Raises `InputError` if the target has a wrong shape or byte values up to 255.
+        """
         require_methods("renderer", renderer, ("render", "adjoint"), "an object such as Simulation.renderer() gives")
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         wanted = "an object such as cortado.image_losses.Pyramid()"
@@ -283,7 +287,7 @@ class Image:
 
 
 def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
-    """Return a float64 copy (rows, columns, 3) of a target; raise `InputError` unless it is a picture of ``shape``."""
+    """Return a float64 copy of a target picture (rows, columns, 3). Raises `InputError` for a wrong shape."""
     image = read_only("target", target)
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
@@ -299,8 +303,8 @@ def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray
 
 @fixed
 class SensorMatch:
-    """A loss: the weighted sum of squared differences between a sensor's reading and a target, divided by squared
-    scales.
+    """A loss: the weighted sum of squared differences between a sensor's reading and a target. The differences are
+    divided by a scale.
 
     Example::
 
@@ -309,8 +313,8 @@ class SensorMatch:
     """
 
     def __init__(self, sensor: Sensor, target: Any, weight: float = 1.0, scale: Any = 1.0):
-        """Set the ``sensor``, the ``weight`` of the sum, and the ``scale``, a number or (k,). ``target`` (k,): a number
-        for each column of the sensor, NaN for columns to ignore."""
+        """Set the ``sensor``, the ``weight`` of the sum, and the ``scale`` of the differences, which is a number or
+        (k,). ``target`` (k,) has one number for each column of the sensor. Columns with a NaN target are ignored."""
         self.sensor, self.weight = checked_sensor(sensor), as_one_number("weight", weight)
         self.target = np.atleast_1d(read_only("target", target))
         self.scale = np.broadcast_to(as_numbers("scale", scale), self.target.shape)
@@ -336,19 +340,22 @@ class SensorMatch:
 
 @fixed
 class Series(Frames):
-    """A loss: the mean over steps of the squared difference between a sensor's readings and a measured series, summed
-    over columns.
+    """A loss: the mean over steps of the squared difference between a sensor's readings and a measured series. The
+    squared differences are summed over columns.
 
-    The series is interpolated linearly to the times of the steps. Steps before its first or after its last time are
-    ignored.
+    The series is interpolated linearly to the times of the steps. Steps before the first time or after the last time of
+    the series are ignored.
 
     Example: ``loss = cortado.losses.Series(gauge, times, heights, time_step=0.002)``
     """
 
     def __init__(self, sensor: Sensor, times: Any, values: Any, time_step: float, every: int = 1, scale: Any = 1.0):
-        """Set the series: increasing ``times`` (m,) [s] and ``values`` (m,) or (m, k), a number for each column of the
-        sensor, NaN to ignore it. ``time_step``: of the problem [s]. ``every``: interval between compared steps.
-        ``scale``: divisor of differences, a number or (k,)."""
+        """Set the ``sensor`` and the measured series. ``times`` (m,) [s] must increase. ``values`` (m,) or (m, k) have
+        one number for each column of the sensor. NaN values are ignored.
+
+        ``time_step`` is the time step of the problem [s]. ``every`` is the interval between compared steps. ``scale``
+        divides the differences and is a number or (k,).
+        """
         moments, series = read_only("times", times), as_numbers("values", values)
         series = series[:, None] if series.ndim == 1 else series
         if moments.ndim != 1 or len(moments) < 2 or not (np.diff(moments) > 0.0).all():
@@ -377,7 +384,7 @@ class Series(Frames):
         super().__init__({k: SensorMatch(sensor, row, weight, scale) for k, row in zip(steps, rows, strict=True)})
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` unless the run has the time step given to this loss."""
+        """Raise `InputError` if the time step of the run differs from the time step of this loss."""
         other = time_steps[np.abs(time_steps - self.time_step) > 1e-6 * time_steps]  # rounded to float32
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"

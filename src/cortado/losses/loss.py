@@ -1,4 +1,4 @@
-"""Protocols of losses for a scene and for a batch, the states that losses read, adjoints, and sums of losses."""
+"""Protocols of losses, the states that losses read, the adjoints of states, and sums of losses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ def precision_of(state: State) -> Precision:
 
 
 class OnHost:
-    """The arrays of a state of one scene or of a batch, which are copied from the device on first use."""
+    """The arrays of a state of one scene or of a batch. They are copied from the device on first use."""
 
     state: State
 
@@ -37,17 +37,18 @@ class OnHost:
 
     @cached_property
     def positions(self) -> np.ndarray:
-        """Positions of the particles, (n, d) [m], in a batch (batch, n, d), float64, read-only."""
+        """Positions of the particles [m], as a read-only float64 array (n, d), or (batch, n, d) for a batch."""
         return self._field("positions")
 
     @cached_property
     def velocities(self) -> np.ndarray:
-        """Velocities of the particles, (n, d) [m / s], in a batch (batch, n, d), float64, read-only."""
+        """Velocities of the particles [m / s], as a read-only float64 array (n, d), or (batch, n, d) for a batch."""
         return self._field("velocities")
 
     @cached_property
     def mass_fractions(self) -> np.ndarray:
-        """Mass fractions of the particles, (n, phases) [-], in a batch (batch, n, phases), float64, read-only."""
+        """Mass fractions of the particles [-], as a read-only float64 array (n, phases), or (batch, n, phases) for a
+        batch."""
         return self._field("mass_fractions")
 
     def _field(self, name: str) -> np.ndarray:
@@ -56,23 +57,24 @@ class OnHost:
 
 @dataclass(frozen=True)
 class Snapshot(OnHost):
-    """A state of a rollout, usually the last one, as NumPy and Warp arrays in the scene's order."""
+    """A state of a rollout, usually the last state, as NumPy and Warp arrays. Particles have the order of the initial
+    particles."""
 
     state: State
     """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields of the solver."""
     dimension: int
     colours: np.ndarray
-    """Colours (phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    """Colours of the phases (phases, 3) in linear RGB from 0 to 1."""
     moment: Moment | None = None
-    """State and parameters of the next step, from which quantities are computed; None if unknown."""
+    """State and parameters of the next step, from which particle quantities are computed. None if they are unknown."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return by name a field of the state ("velocities"), a quantity of its particles ("density", "pressure"), or
-        the load on a solid ("rotor.load"), float64, read-only; see `docs/sensors.md`. Raise `InputError` for any other
-        name."""
+        """Return an array by name: a field of the state ("velocities"), a quantity of its particles ("density",
+        "pressure"), or the load on a solid ("rotor.load"). Arrays are float64 and read-only. `docs/sensors.md` lists
+        the names. Raises `InputError` for an unknown name."""
         if name in ADJOINT_FIELDS:
             return getattr(self, name)
         if isinstance(name, str) and name in self.state.names:
@@ -87,8 +89,8 @@ class Snapshot(OnHost):
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Tables of the scene's solids in their initial positions; fields of the state have the positions of moving
-        solids."""
+        """Tables of the scene's solids in their initial positions. The current positions of moving solids are in the
+        state."""
         return moment_of(self).evaluator().solids
 
     @property
@@ -110,7 +112,8 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """Return the state and parameters from which quantities are computed; raise `InputError` if unknown."""
+    """Return the state and parameters from which particle quantities are computed. Raises `InputError` if they are
+    unknown."""
     if end.moment is None:
         raise InputError("The state has no simulation, with which quantities are computed: take a state of a run.")
     return end.moment
@@ -121,26 +124,28 @@ class StepBar:
     """Derivatives of a loss with respect to the parameters of a step."""
 
     row: int
-    """Number of the step in the run, counted from 0, see `row_of` of `cortado.runs.quantity_values`."""
+    """Number of the step in the run, counted from 0."""
     parameters: Mapping[str, np.ndarray]
-    """Derivatives by parameter name, in a batch with a first axis for the scenes; parameters over time have one row."""
+    """Derivatives by parameter name. Parameters over time have one entry for the step. In a batch the first axis is the
+    scene."""
 
 
 @dataclass(frozen=True, repr=False)
 class SnapshotAdjoint:
-    """Derivatives of a loss with respect to a state, the phases' colours, quantities, and the parameters of a step."""
+    """Derivatives of a loss with respect to a state, colours, particle quantities, and the parameters of a step."""
 
     state: State
     """Derivatives with respect to positions, velocities and mass fractions, as Warp arrays."""
     colours: np.ndarray
     """Derivatives (phases, 3) with respect to the phases' colours."""
     quantities: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Derivatives with respect to quantities of the particles, by name."""
+    """Derivatives with respect to particle quantities, by name."""
     step: StepBar | None = None
-    """Derivatives with respect to the parameters of the next step; None before `through_quantities`."""
+    """Derivatives with respect to the parameters of the next step, computed by `through_quantities`."""
 
     def through_quantities(self, end: "Snapshot | SnapshotBatch") -> "SnapshotAdjoint":
-        """Apply the chain rule to quantities: return derivatives with respect to the state and the parameters."""
+        """Convert derivatives with respect to particle quantities, by the chain rule, to derivatives with respect to
+        the state and the parameters."""
         if not self.quantities:
             return self
         moment = moment_of(end)
@@ -154,12 +159,13 @@ class SnapshotAdjoint:
 
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
-"""Derivatives of a loss: a tuple of arrays for positions and velocities (n, d) and, optionally, mass fractions (n,
-phases); a `State` of Warp arrays; or a table by state field and quantity, 0 for missing names."""
+"""Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, optionally,
+mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. Missing derivatives are 0.
+"""
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """Convert an adjoint to a table of arrays by state field and quantity, with vectors (n, d)."""
+    """Convert derivatives of a loss to a table of arrays by state field and quantity. Vectors have the shape (n, d)."""
     if isinstance(bar, Mapping):
         return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
@@ -168,7 +174,7 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
 
 
 def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-    """Convert an adjoint to Warp arrays for fields, and a table by name for quantities."""
+    """Convert derivatives of a loss to Warp arrays for fields and to a table for quantities."""
     if isinstance(bar, SnapshotAdjoint):
         return bar
     no_colours = np.zeros_like(end.colours)
@@ -181,8 +187,8 @@ def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
 
 
 def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...] = ()) -> np.ndarray:
-    """Return the derivative of a loss along tangents ``dots`` of fields, quantities and colours, 0 for missing names;
-    of shape ``leading``, which is (batch,) for a batch. Vectors are all (n, d), or all (n, 3)."""
+    """Return the derivative of a loss along tangents of fields, quantities and colours. ``bar`` has the derivatives of
+    the loss. The result has the shape ``leading``, which is (batch,) for a batch. Missing names count as 0."""
     arrays = by_field(bar, np.shape(dots["positions"])[-1])
     arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
     products = [
@@ -194,19 +200,22 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
 
 
 class Loss(Protocol):
-    """Protocol of a loss: a differentiable number computed from the last state of a trajectory.
+    """Protocol of a loss, which is a differentiable number computed from the last state of a trajectory.
 
-    A user-defined loss may have a method ``adjoint(end)``, which returns only the derivatives, instead of
-    `value_and_adjoint`.
+    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`. The method returns only the
+    derivatives.
     """
 
     def value(self, end: Snapshot) -> float:
         """Return the value of the loss for the last state of a run."""
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the loss and its derivatives: a tuple of NumPy arrays, a table of arrays by field or quantity,
-        ``{"density": array}``, or a `State` of Warp arrays. ``end.state.like()`` makes a state of zeros, and the
-        state's ``set({"positions": array})`` fills it."""
+        """Return the loss and its derivatives.
+
+        The derivatives are a tuple of NumPy arrays, a table of arrays by field or quantity such as ``{"density":
+        array}``, or a `State` of Warp arrays. To make a `State`, call ``end.state.like()`` for zeros, and then
+        ``set({"positions": array})``.
+        """
 
 
 @fixed
@@ -217,7 +226,7 @@ class Frames:
     """
 
     def __init__(self, losses: Mapping[int, Loss]):
-        """Set ``losses`` {number of steps: loss}; the first state has number 0."""
+        """Set ``losses``, a table from numbers of steps to losses. The initial state has number 0."""
         if not isinstance(losses, Mapping) or not losses:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
         for step in losses:
@@ -226,16 +235,17 @@ class Frames:
         self.losses = FixedDict(losses)
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` if a loss does not suit a run with time steps (scenes,) [s]."""
+        """Raise `InputError` if a loss does not suit the time steps of a run (scenes,) [s]."""
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the losses and their targets; checkpoints store it."""
+        """Return a text that identifies the losses and their targets, for checkpoints."""
         return " ".join(f"{step}:{fingerprint(loss)}" for step, loss in sorted(self.losses.items()))
 
 
 def fingerprint(loss: Any) -> str:
-    """Return a text that identifies a loss: its ``fingerprint``, the code of a function, or the type's name.
+    """Return a text that identifies a ``loss``. It comes from the loss's method ``fingerprint``, from the code of a
+    function, or from the name of the type.
 
     Example: ``print(cortado.losses.fingerprint(cortado.losses.CentreOfMass([1.0, 0.2])))``
     """
@@ -244,15 +254,15 @@ def fingerprint(loss: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SnapshotBatch(OnHost, Sequence[Snapshot]):
-    """A state of a batch's rollout; ``end[b]`` is the `Snapshot` of scene b."""
+    """A state of all scenes of a batch. ``end[b]`` is the `Snapshot` of scene b."""
 
     state: State
-    """Warp arrays (batch n,) in the scenes' order; `State.numbers` returns arrays (batch, n, ...)."""
+    """Warp arrays (batch * n,), scene by scene. `State.numbers` returns arrays (batch, n, ...)."""
     dimension: int
     colours: np.ndarray
-    """Colours (batch, phases, 3) of the phases: red, green and blue, linear, from 0 to 1."""
+    """Colours of the phases (batch, phases, 3) in linear RGB from 0 to 1."""
     moment: Moment | None = None
-    """State and parameters of the next step; see `Snapshot.moment`."""
+    """State and parameters of the next step, as in `Snapshot.moment`."""
 
     def __repr__(self) -> str:
         particles = counted(len(self.state.positions) // len(self), "particle")
@@ -276,7 +286,7 @@ class SnapshotBatch(OnHost, Sequence[Snapshot]):
 
     @cached_property
     def on_host(self) -> dict[str, np.ndarray]:
-        """All fields of all scenes by name, copied from the device together; float64, read-only."""
+        """Read-only float64 arrays of all fields of all scenes, by name, copied from the device together."""
         return {name: _read_only(array) for name, array in self.state.numpy(self.dimension).items()}
 
     def _field(self, name: str) -> np.ndarray:
@@ -285,7 +295,7 @@ class SnapshotBatch(OnHost, Sequence[Snapshot]):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class _Member(Snapshot):
-    """A snapshot of a scene of a batch, which copies the arrays of all scenes to the host together."""
+    """A snapshot of one scene of a batch. On first use, the arrays of all scenes are copied together."""
 
     batch: SnapshotBatch
     number: int
@@ -299,12 +309,12 @@ class _Member(Snapshot):
 
 @runtime_checkable
 class BatchedLoss(Protocol):
-    """Protocol of a loss that treats all scenes of a batch together, with the same bits as for single scenes."""
+    """Protocol of a loss that is computed for all scenes of a batch together. The results must have the same bits as
+    for single scenes."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """Return the losses (batch,), with any value for lost scenes."""
+        """Return the losses (batch,). The loss of a lost scene is arbitrary."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays:
-        ``end.state.like()`` makes a state of zeros, and the state's ``set({"positions": array})`` fills it from an
-        array (batch, n, d)."""
+        """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays. To make them, call
+        ``end.state.like()`` for zeros, and then ``set({"positions": array})`` with an array (batch, n, d)."""

@@ -1,4 +1,4 @@
-"""Checks of users' losses, and the assignment of losses to states by number of steps."""
+"""Check user-defined losses, and assign losses to states by the number of steps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -28,16 +28,15 @@ from cortado.sph.function_text import code_words
 
 WarpFunction = Callable[[wp.array, wp.array, wp.array], Any]
 LAUNCHED = "positions", "velocities", "an array for the loss"
-"""Descriptions of the arguments of a function of Warp arrays, for messages."""
 
 
 @fixed
 class Recorded:
-    """A loss made of a function of Warp arrays, differentiated by Warp's tape.
+    """A loss made from a function of Warp arrays, differentiated by Warp's tape.
 
-    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``, an array (1,) in the precision of
-    the vectors (n,). Put a sum that is used non-linearly into a separate Warp function: Warp's derivatives of loops in
-    kernels would be wrong.
+    ``function(positions, velocities, loss)`` launches kernels that add to ``loss``. ``loss`` is an array (1,) in the
+    precision of the vectors (n,). Compute a sum in a separate Warp function if its value is used non-linearly, because
+    Warp's derivatives of loops in kernels would be wrong.
 
     Example::
 
@@ -53,7 +52,7 @@ class Recorded:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies the function and its numbers, which a resumed search compares."""
+        """Return a text that identifies the function and its constants, for resumed searches."""
         return f"{type(self).__qualname__} {code_words(self.function)}"
 
     @WARP
@@ -80,7 +79,8 @@ FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
 
 
 class CheckedLoss:
-    """A wrapper of a loss that checks values and adjoints, and prefers ``adjoint`` to ``value_and_adjoint``."""
+    """A wrapper of a loss that checks values and derivatives. It calls ``adjoint`` if the loss has this method, or else
+    ``value_and_adjoint``."""
 
     def __init__(self, loss: Any):
         self._loss = loss
@@ -89,18 +89,19 @@ class CheckedLoss:
         return as_one_number("the loss's value", self._loss.value(end))
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the checked loss and its derivatives, with NumPy arrays in float64."""
+        """Return the checked loss and its derivatives. NumPy arrays are float64."""
         if hasattr(self._loss, "adjoint"):
             return self.value(end), self._checked(self._loss.adjoint(end), end)
         value, bar = self._loss.value_and_adjoint(end)
         return as_one_number("the loss's value", value), self._checked(bar, end)
 
     def values(self, end: SnapshotBatch, members: Sequence[int]) -> np.ndarray:
-        """Return the losses (batch,), NaN for scenes outside ``members``."""
+        """Return the losses (batch,), which are NaN for scenes outside ``members``."""
         return _among(members, [self.value(end[b]) for b in members], len(end))
 
     def values_and_adjoints(self, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
-        """Return the `values` and the states' adjoints, 0 for scenes outside ``members``."""
+        """Return the `values` and the derivatives with respect to the states. Derivatives of scenes outside ``members``
+        are 0."""
         found, state, colours = np.full(len(end), np.nan), end.state.like(), np.zeros_like(end.colours)
         quantities: dict[str, np.ndarray] = {}
         for b in members:
@@ -151,7 +152,8 @@ def _among(members: Sequence[int], values: Any, batch: int) -> np.ndarray:
 
 
 def as_loss(loss: Any) -> CheckedLoss:
-    """Wrap a loss, or a function of Warp arrays, with checks of results; raise `InputError` for anything else."""
+    """Wrap a loss or a function of Warp arrays, so that results are checked. Raises `InputError` for any other
+    object."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object of this class.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
@@ -205,11 +207,11 @@ def _layout(array: wp.array) -> str:
 
 
 class LossesByStep(dict[int, CheckedLoss]):
-    """The losses of a run by the number of steps before the state."""
+    """The losses of a run by number of steps."""
 
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
-        """Take a ``loss`` of the state after all ``steps``, or `Frames`. Raise `InputError` for anything else, for
-        frames beyond ``steps``, and for frames at fixed times if time steps are ``chosen`` during the run."""
+        """Take a ``loss`` of the last state, or a `Frames` loss. Raises `InputError` for any other object, and for
+        frames beyond ``steps``. If time steps are ``chosen`` during the run, frames at fixed times are errors too."""
         if chosen and getattr(loss, "time_step", None) is not None:
             raise InputError(
                 f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
@@ -234,8 +236,8 @@ class LossesByStep(dict[int, CheckedLoss]):
         return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Return the sum of the losses, given states by number of steps; for a batch (batch,), NaN for scenes outside
-        ``going``, which is None for a single scene."""
+        """Return the sum of the losses of the states in ``ends``, which are given by number of steps. For a batch the
+        shape is (batch,), and scenes outside ``going`` get NaN."""
         self._check(ends)
         return sum(
             loss.value(ends[step]) if going is None else loss.values(ends[step], going) for step, loss in self.items()
@@ -244,7 +246,7 @@ class LossesByStep(dict[int, CheckedLoss]):
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
-        """Return the `total` of the losses, and the states' adjoints by number of steps."""
+        """Return the `total` of the losses and the derivatives with respect to the states, by number of steps."""
         self._check(ends)
         total: Any = 0.0
         bars = {}

@@ -1,4 +1,4 @@
-"""Optimisers, the problems and coordinates that they search in, fits, and replay logs to resume a search from."""
+"""Optimisers, searches and their coordinates, fits, and logs to resume a search."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,5 @@
-"""The files of a data set: one file per run while runs are added, later one file per purpose, and the metadata."""
+"""The files of a data set. While runs are computed, each run has its own file. At the end there are three files with
+the runs for training, validation and tests, and a file with the metadata."""
 
 import io
 import json
@@ -20,9 +21,9 @@ from cortado.version import __version__
 
 METADATA, PARTS, PURPOSES = "metadata.json", "runs", ("train", "valid", "test")
 REACH = 1.6
-"""Connectivity radius of a learned simulator [spacings]; fluid at rest is up to 1.5 spacings from a wall particle."""
+"""Connectivity radius of a learned simulator [spacings]."""
 SPARE = 1.02
-"""Free disk space needed to assemble runs, relative to the size of these runs."""
+"""Disk space for assembling runs, relative to the size of the runs."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class DatasetFolder:
         self.out, self.parts = out, out / PARTS
 
     def save(self, number: int, run: OneRun) -> None:
-        """Write a run to a new file atomically; HDF5 writes to memory first, because a full disk may crash HDF5."""
+        """Write a run to a new file atomically. HDF5 writes to memory first, because HDF5 may crash on a full disk."""
         import h5py
 
         content = io.BytesIO()
@@ -60,7 +61,7 @@ class DatasetFolder:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """The metadata; empty if the file is damaged or missing."""
+        """Return the metadata, or an empty table if the file is damaged or missing."""
         try:
             return dict(parsed_json((self.out / METADATA).read_bytes()))
         except (OSError, ValueError, TypeError):
@@ -68,7 +69,7 @@ class DatasetFolder:
 
     @property
     def runs(self) -> dict[int, FinishedRun]:
-        """Finished runs by number; a purpose's file replaces the file of a single run."""
+        """Return the finished runs by number, from assembled files and from files of single runs."""
         return self._read[0]
 
     @property
@@ -104,8 +105,9 @@ class DatasetFolder:
         return max([int(self.metadata.get("runs", 0)), *(number + 1 for number in numbers)])
 
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
-        """Write each purpose's file that does not contain exactly the runs in ``split``. All new files are complete
-        before an old file is replaced. Raise `ComputationError` and change nothing if the disk is full."""
+        """Write the files for training, validation and tests if their runs differ from ``split``. Old files are
+        replaced after all new files are complete. If the disk is full, nothing changes and `ComputationError` is
+        raised."""
         stale = {}
         for purpose, numbers in split.items():
             path = self.path(purpose)
@@ -154,7 +156,8 @@ class DatasetFolder:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], folder: DatasetFolder, runs: int
 ) -> dict[str, Any]:
-    """Return the metadata of a data set for LagrangeBench, with run numbers by purpose in ``split``."""
+    """Return the metadata of a data set for LagrangeBench. ``split`` maps training, validation and tests to run
+    numbers."""
     frames, (origin, size, periods) = table.steps // table.write_every + 1, bounds_of(scene)
     every = [folder.runs[number].statistics for own in split.values() for number in own]
     train = [folder.runs[number].statistics for number in split["train"]]

@@ -1,4 +1,4 @@
-"""Data sets of runs with varied scenes, for learned simulators: the table [dataset], random values, and arrays."""
+"""Data sets of varied runs for learned simulators: the table [dataset], random values, and arrays."""
 
 import json
 from collections import defaultdict
@@ -50,31 +50,31 @@ Ranges = Annotated[
 
 
 class DatasetTable(Table):
-    """[dataset]: the length and the variations of the runs of a data set, and the stored arrays."""
+    """[dataset]: the number of steps, the variations and the stored arrays of the runs of a data set."""
 
     steps: Annotated[int, count(1, 10_000_000)]
     """Time steps of each run."""
     write_every: Annotated[int, count(1, 10_000_000)] = 1
-    """Time steps from one frame to the next; steps is a multiple of it."""
+    """Time steps from one frame to the next; steps must be a multiple of this number."""
     vary: Ranges = Field(default_factory=dict)
-    """Ranges by the key of a scene's value, in quotes, as in vary."phase.0.viscosity" = [0.1, 1.0]. Every component of
-    a value is drawn independently for every run."""
+    """Ranges of values, by the key of a scene in quotes, as in vary."phase.0.viscosity" = [0.1, 1.0]. For each run,
+    every component of a value is drawn independently."""
     logarithmic: tuple[Text, ...] = ()
-    """Keys of vary whose logarithm is drawn from a uniform distribution."""
+    """Keys of vary with a uniform distribution of the value's logarithm."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0, le=0.5)] = 0.0
-    """Standard deviation of noise in every coordinate of the first positions [spacings]"""
+    """Standard deviation of the noise in every coordinate of the initial positions [spacings]"""
     velocity_noise: Annotated[float, quantity("m/s", ge=0.0)] = 0.0
-    """Standard deviation of noise in every component of the first velocities [m/s]"""
+    """Standard deviation of the noise in every component of the initial velocities [m/s]"""
     valid: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """Fraction of the runs for validation; a fraction above 0 gets at least one run."""
+    """Fraction of the runs for validation; a fraction above 0 means at least one run."""
     test: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """Fraction of the runs for tests; a fraction above 0 gets at least one run."""
+    """Fraction of the runs for tests; a fraction above 0 means at least one run."""
     walls: Flag = True
     """Append wall particles to the fluid particles."""
     tangents: Annotated[int, count(0, 1_000)] = 0
-    """Number of random directions of the first state along which each run is differentiated."""
+    """Number of random directions of the initial state along which each run is differentiated."""
     tangent_frames: Literal["last", "all"] = "last"
-    """Frames whose derivatives are stored."""
+    """Frames with stored derivatives."""
     seed: Annotated[int, count(0, 2**31)] = 0
     """Seed of all random numbers."""
 
@@ -96,7 +96,8 @@ class DatasetTable(Table):
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return run numbers by purpose. The purpose of a run does not depend on the number of runs."""
+        """Return the numbers of the runs for training, validation and tests. The use of a run does not depend on the
+        total number of runs."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
@@ -115,7 +116,7 @@ class DatasetTables(Table):
 
 @dataclass(frozen=True)
 class Sample:
-    """Random values for a run of a data set, determined by the table's seed and the run's number."""
+    """Random values for a run of a data set. They depend only on the seed and the number of the run."""
 
     table: DatasetTable
     number: int
@@ -138,7 +139,7 @@ class Sample:
         return [f"{key}={json.dumps(value)}" for key, value in self.values.items()]
 
     def start(self, positions: np.ndarray, velocities: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
-        """Return noisy first positions [m] and velocities [m/s] (n, d) by name, without arrays that have no noise."""
+        """Return noisy initial positions [m] and velocities [m/s] (n, d) by name. Arrays without noise are left out."""
         random, found = self._random(1), {}
         for name, array, size in (
             ("initial_positions", positions, self.table.position_noise * spacing),
@@ -150,7 +151,8 @@ class Sample:
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Return a random direction of the first state by name, with standard deviations ``sizes`` [m], [m/s]."""
+        """Return a random direction of the initial state by name. ``sizes`` are the standard deviations for positions
+        [m] and velocities [m/s]."""
         random = self._random(2, which)
         return {name: size * random.standard_normal(shape) for name, size in zip(FIRST, sizes, strict=True)}
 
@@ -160,22 +162,22 @@ class Sample:
 
 FIRST = ("initial_positions", "initial_velocities")
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
-"""Particle types of LagrangeBench, the first unused type, for further phases, and the number of types."""
+"""Particle types of LagrangeBench, the type of further phases, and the number of types."""
 MARGIN = 3
-"""Distance from the container's closed sides to the bounds [spacings]. If one axis is periodic, LagrangeBench treats
-all axes as periodic; the margin keeps opposite walls from interacting."""
+"""Distance from the container to the bounds of the data set [spacings]. It separates opposite walls, because
+LagrangeBench treats all axes as periodic if one axis is periodic."""
 
 
 @dataclass(frozen=True)
 class OneRun:
     arrays: dict[str, np.ndarray]
     statistics: dict[str, Any]
-    """Count, sum and sum of squares of the components of velocities and accelerations of fluid [m per frame]; upper
-    ends of all positions [m]; number of all particles."""
+    """Statistics of the run: count, sum and sum of squares of fluid velocities and accelerations [m per frame], the
+    upper ends of all positions [m], and the number of particles."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
-    """Run and differentiate a simulation from a sample's start; raise `DivergedError` or `InputError`."""
+    """Run and differentiate a simulation from the initial state of a sample. Raises `DivergedError` or `InputError`."""
     table, scene = sample.table, simulation.scene
     start = sample.start(simulation.positions, simulation.velocities, scene.discretisation.spacing)
     trajectory = simulation.run(table.steps, start, record_every=table.write_every)
@@ -200,9 +202,10 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lower corner, the lengths, and the periods (0 without) of a data set's bounds, each (d,) [m].
+    """Return the lower corner, the lengths and the periods of the bounds of a data set, each (d,) [m]. Periods are 0
+    along axes without a period.
 
-    Raise `InputError` without a container, and if particles wait far outside of it.
+    Raises `InputError` without a container, or if particles wait far outside the container.
     """
     ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
@@ -221,7 +224,6 @@ def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (frames, b, d) [m] and types (b,) of wall particles."""
     places = np.repeat(np.asarray(simulation.walls, dtype=np.float64)[None], frames, axis=0)
     kinds = np.full(len(simulation.walls) if frames else 0, WALL)
     numbers = wall_numbers(simulation.scene.solid)
@@ -236,8 +238,8 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
 
 
 def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics of first and second differences of positions (frames, n, d), by nearest periodic images, and
-    the upper ends (d,) [m] of places relative to the bounds; raise `InputError` if one is below them."""
+    """Return statistics of first and second differences of positions (frames, n, d), and the upper ends of all
+    positions (d,) [m]. Raises `InputError` if a position is below the bounds."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         raise InputError(

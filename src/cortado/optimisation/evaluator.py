@@ -1,4 +1,4 @@
-"""The problem of a search as a function of a vector, and a test if gradients predict changes of the loss."""
+"""The objective function of a search, and a test of whether gradients predict changes of the loss."""
 
 import math
 import warnings
@@ -20,28 +20,27 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Values
 
 Parameters = dict[str, Any]
-"""Parameters by name: floats for numbers at the start, otherwise float64 arrays."""
+"""Parameters by name. A value is a float if the initial value was a number, or else a float64 array."""
 GREATEST_GRADIENT = 1e150
-"""Greatest gradient component that counts as finite, because optimisers compute squares."""
+"""Greatest gradient component that counts as finite. Its square does not overflow."""
 REFUSED = (DivergedError, InputError)
-"""Errors after which a trial has an infinite loss."""
+"""Errors that give a trial point an infinite loss."""
 WRONG = 10.0
-"""A step contradicts its gradients if the change of the loss differs from the predictions by more than this factor."""
+"""Factor between predicted and real changes of the loss above which a gradient counts as wrong."""
 FELT = 0.01
-"""Greatest change of the loss, relative to the range of all losses, that counts as none."""
+"""Greatest negligible change of the loss, relative to the range of all losses."""
 ROUND_OFF = 1e-5
-"""Predictions below this part of the greatest loss are not tested, because float32 losses are not precise enough."""
+"""Round-off of a float32 loss, relative to the greatest loss. Smaller predictions are not tested."""
 MISLED, FEW = 0.25, 2
-"""A search is misled if this fraction of the tested steps, and this number, contradict their gradients."""
+"""Least fraction and least number of steps with wrong gradients in a misled search."""
 LEAST = 8
-"""Least number of evaluations of a search whose loss has stopped falling."""
 
 
 class Optimisable(Protocol):
-    """Protocol of problems for `optimise`. A text `fingerprint` is optional; resuming a search compares it."""
+    """Protocol of problems for `optimise`. The optional text `fingerprint` is compared when a search is resumed."""
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the loss and its gradient, arrays by parameter name in the parameters' shapes."""
+        """Return the loss, and its gradient as arrays by parameter name in the shapes of the parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +50,19 @@ class Record:
     iteration: int
     """Index of the evaluation, from 0."""
     updates: int
-    """Number of updates before this evaluation; a line search may evaluate several times per update."""
+    """Number of updates before this evaluation. A line search may need several evaluations per update."""
     loss: float
     gradient_norm: float
     """Euclidean norm of the gradient over all parameters."""
     parameters: Parameters
     """Parameters at which the loss was evaluated."""
     replayed: bool
-    """True if the evaluation was read from the checkpoint."""
+    """True if the evaluation comes from the checkpoint."""
     refused: int = 0
-    """Number of refused steps before this evaluation, after which runs diverged or parameters were out of range."""
+    """Number of refused steps before this evaluation. A step is refused if its run diverges or its parameters are out
+    of range."""
     left_out: int = 0
-    """Number of runs that ensemble averages left out so far, without replayed evaluations."""
+    """Number of failed runs that ensemble averages ignored so far, without replayed evaluations."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -70,15 +70,16 @@ class Record:
 
 @dataclass
 class Promises:
-    """A test of a search's gradients: predicted and real changes of the loss from each evaluation to the next.
+    """A test of a search's gradients, which compares predicted and real changes of the loss between successive
+    evaluations.
 
-    The change of a smooth loss is near the predictions by the slopes at both ends of a step, or between them. Steps
-    along which the slope changes sign are not tested, because they may cross a minimum.
+    The change of a smooth loss is close to the predictions from the slopes at the two ends of a step, or between them.
+    Steps with a change of sign of the slope are not tested, because they may cross a minimum.
     """
 
     losses: list[float] = field(default_factory=list)
     steps: list[tuple[float, float, float]] = field(default_factory=list, repr=False)
-    """For each step: the change predicted at its start, the change predicted at its end, and the real change."""
+    """Three changes of the loss for each step: predicted at the start, predicted at the end, and real."""
     _last: LoggedEvaluation | None = field(default=None, repr=False)
     _best: LoggedEvaluation | None = field(default=None, repr=False)
 
@@ -94,7 +95,7 @@ class Promises:
             self._best = evaluation
 
     def held(self, lower: Vector, upper: Vector, layout: ParameterLayout) -> str:
-        """Return a sentence about parameters whose bounds prevent a lower loss, or an empty string."""
+        """Return a sentence on bounds that prevent a lower loss, or an empty string."""
         if self._best is None:
             return ""
         best, gradient = self._best.parameters, self._best.gradient
@@ -105,7 +106,7 @@ class Promises:
 
     @property
     def kept(self) -> tuple[int, int]:
-        """Return the number of steps that contradict their gradients, and of all tested steps."""
+        """Return the number of steps with wrong gradients, and the number of tested steps."""
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
         felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
@@ -120,8 +121,8 @@ class Promises:
         return broken >= max(FEW, MISLED * told)
 
     def stays(self, converged: bool) -> bool:
-        """Return True if the loss has stopped falling at a large part of the first loss: it fell by less than `FELT`
-        over the last third of the evaluations."""
+        """Return True if the loss has stopped falling while it is still large. It then changed by less than `FELT` over
+        the last third of the evaluations."""
         best, before = min(self.losses), min(self.losses[: -max(len(self.losses) // 3, 1)], default=np.inf)
         stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
         return best > FELT * self.losses[0] and (converged or stopped)
@@ -129,9 +130,11 @@ class Promises:
     def doubt(
         self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str
     ) -> tuple[bool, bool, str]:
-        """Return if a search was misled, if its loss stays, and sentences of doubt with advice. ``estimator``: None for
-        the problem's gradient; ``converged``: the optimiser's test was met; ``is_run``: the loss is of a simulation's
-        run; ``held``: sentence of `held`."""
+        """Return whether a search was misled, whether its loss stopped falling, and sentences with advice.
+
+        ``estimator`` is None for the problem's gradient. ``converged`` is True if the optimiser converged. ``is_run``
+        is True if the loss belongs to a simulation. ``held`` is the sentence from `held`.
+        """
         by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
         misled, stays = self.misled and (is_exact or not by_direction), not held and self.stays(converged)
         to_try = ["another start"]
@@ -159,7 +162,8 @@ class Promises:
 
 @dataclass
 class Evaluator:
-    """The optimiser's function of a vector, which first replays the log, and later computes and appends to the log."""
+    """The objective function of the optimiser. It first replays logged evaluations, and then computes and logs new
+    ones."""
 
     problem: Optimisable
     estimator: Any
@@ -174,10 +178,11 @@ class Evaluator:
     logged: int = 0
 
     left_out: int = 0
-    """Number of runs that averages of an ensemble left out."""
+    """Number of failed runs that ensemble averages ignored."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Estimate as the ensemble does, count the runs that its averages leave out, and warn only the first time."""
+        """Return the ensemble's estimate, and count the failed runs that its averages ignore. Only the first failure
+        gives a warning."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -195,7 +200,8 @@ class Evaluator:
         return found
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return loss and gradient at a vector, or None if the run fails, with an infinite loss in the log."""
+        """Return the loss and its gradient at a vector, or None if the run fails. A failed run is logged with an
+        infinite loss."""
 
         def computed(vector: Vector) -> LoggedEvaluation:
             try:
@@ -206,7 +212,7 @@ class Evaluator:
         return self._next(vector, computed)
 
     def _next(self, vector: Vector, compute: Callable[[Vector], LoggedEvaluation]) -> tuple[float, Vector] | None:
-        """Replay or compute the next evaluation, and note it in the history unless its loss is infinite."""
+        """Replay or compute the next evaluation. Evaluations with a finite loss are added to the history."""
         replayed = self.logged < len(self.log)
         evaluation = self._replay(vector) if replayed else compute(vector)
         if not replayed:
@@ -232,8 +238,8 @@ class Evaluator:
         return evaluation.loss, evaluation.gradient.copy()
 
     def losses(self, vectors: Sequence[Vector]) -> list[float]:
-        """Return the losses at vectors (size,), infinite for runs that diverge and parameters out of range. Trial
-        losses enter the log with gradient 0, but not the history."""
+        """Return the losses at several vectors (size,). The loss is infinite if a run diverges or parameters are out of
+        range. The losses are logged without a gradient and are not part of the history."""
         known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
         left = vectors[len(known) :]
         found: list[float] = []
@@ -258,7 +264,6 @@ class Evaluator:
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
 
     def _evaluated(self, parameters: dict[str, Any]) -> tuple[Any, Mapping[str, Any]]:
-        """Return loss and gradient; raise `InputError` if the problem returns anything else."""
         estimator = self if isinstance(self.estimator, Ensemble) else self.estimator
         found: Any = self.problem.value_and_gradient(parameters, gradient=estimator)
         if isinstance(found, tuple | list):
@@ -273,7 +278,8 @@ class Evaluator:
         )
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the next logged evaluation, or one ``ahead`` of it; raise `InputError` if its vector differs."""
+        """Return the next logged evaluation, or the evaluation that comes ``ahead`` places later. Raises `InputError`
+        if its vector differs."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
@@ -286,7 +292,7 @@ class Evaluator:
         return evaluation
 
     def _compute(self, vector: Vector) -> LoggedEvaluation:
-        """Evaluate the problem; after the first evaluation, errors get advice about the search."""
+        """Evaluate the problem. Errors after the first evaluation include advice on the search."""
         try:
             return self._computed(vector)
         except InputError as error:
@@ -309,7 +315,7 @@ class Evaluator:
             raise error.with_advice("; ".join([*told, least])) from error
 
     def _computed(self, vector: Vector) -> LoggedEvaluation:
-        """Evaluate the problem; raise an error for a gradient of other names or shapes, and if anything is not
+        """Evaluate the problem. Raises an error for a gradient with wrong names or shapes, and for values that are not
         finite."""
         loss, gradients = self._evaluated(self.layout.unravel(vector))
         loss = as_one_number("The problem's loss", loss)

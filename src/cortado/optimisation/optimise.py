@@ -1,5 +1,5 @@
-"""`cortado.optimise`: lower the loss of a problem within bounds, with a history and a checkpoint; `cortado.evaluate`:
-compute losses at independent points, such as a population of a search."""
+"""Search for the parameters with the lowest loss (`cortado.optimise`), and compute losses at independent points
+(`cortado.evaluate`)."""
 
 import os
 import re
@@ -32,9 +32,9 @@ from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, R
 from cortado.scene.parameter_values import Values, require_points
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
-"""A function from parameters by name to the loss and its gradient by name."""
+"""A function that maps parameters by name to the loss and its gradient by name."""
 MOST_ITERATIONS = 10_000_000
-"""Greatest number of updates of a search, also in task files."""
+"""Greatest number of updates of a search."""
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ class Function:
         return str(getattr(self.function, "__qualname__", kind.__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the function's result; raise `InputError` if a gradient estimator is given."""
+        """Return the result of the function. Raises `InputError` if a gradient estimator is given."""
         if gradient is not None:
             raise InputError("gradient is given, but must be left out, as a function returns its gradient.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
-    """Return a problem unchanged, or wrap a function in a problem; raise `InputError` for anything else."""
+    """Return a problem unchanged, or make a problem of a function. Raises `InputError` for any other object."""
     if isinstance(problem, type):
         raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object of this class.")
     if hasattr(problem, "value_and_gradient"):
@@ -72,35 +72,36 @@ class Result:
     """The best parameters of an optimisation, with its history."""
 
     parameters: Parameters
-    """Parameters with the lowest loss seen."""
+    """Parameters with the lowest loss."""
     loss: float
-    """Lowest loss seen."""
+    """Lowest loss."""
     last_parameters: Parameters
-    """The optimiser's last iterate."""
+    """Parameters after the last update."""
     history: tuple[Record, ...]
     """Records of all evaluations, in order."""
     updates: int
-    """Number of updates by the optimiser, including those replayed from the checkpoint."""
+    """Number of updates by the optimiser, including updates that were replayed from the checkpoint."""
     evaluations: int
-    """Number of evaluations in the history, including those replayed from the checkpoint."""
+    """Number of evaluations in the history, including evaluations that were replayed from the checkpoint."""
     message: str
-    """Sentence about the end of the search."""
+    """Sentence on how the search ended."""
     converged: bool
-    """True if the optimiser's convergence test was met and the gradient agreed with the steps; only L-BFGS has one."""
+    """True if the convergence test of the optimiser was met and `misled` is false. Only L-BFGS has a
+    convergence test."""
     refused: int = 0
-    """Number of refused steps, which are not in the history: the run after the step diverged, or a parameter was out of
-    range."""
+    """Number of refused steps, which are not in the history. A step is refused if its run diverges or if one of its
+    parameters is out of range."""
     left_out: int = 0
-    """Number of runs that ensemble averages left out because they diverged or parameters were out of range, without
-    replayed evaluations."""
+    """Number of runs that averages over ensembles left out, because the run diverged or a parameter was out of range.
+    Runs from the checkpoint do not count."""
     misled: bool = False
-    """True if the gradient disagreed with the change of the loss, so that the search is not to be trusted; `message`
-    gives advice. Gradients mislead beyond the horizon of `cortado.certify`."""
+    """True if the gradient disagreed with the change of the loss. Do not trust the search then; `message` gives advice.
+    Gradients are often wrong beyond the horizon of `cortado.certify`."""
     stays: bool = False
-    """True if the loss stayed a large part of the first loss, as in a wrong local minimum."""
+    """True if the lowest loss is still a large fraction of the first loss, as in a wrong local minimum."""
     problem: Any = field(default=None, repr=False)
-    """The solved `Problem`, also in other coordinates, for pictures in notebooks; None for other problems and in
-    pickled results."""
+    """The optimised `Problem`, for pictures in notebooks. It is None for any other type of problem, and in pickled
+    results."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None}
@@ -117,7 +118,7 @@ class Result:
 
 
 def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
-    """Return the start as float64 arrays; raise `InputError` for unsuitable values."""
+    """Return the start as float64 arrays. Raises `InputError` for values that are not finite numbers."""
     if not isinstance(start, Mapping):
         raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
@@ -132,8 +133,8 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 
 
 def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], start: Mapping[str, Vector]) -> tuple[Any, Any]:
-    """Return lower and upper bounds by name, infinite without a bound; raise `InputError` for bounds that do not match
-    the parameters, or exclude the start."""
+    """Return lower and upper bounds by name. A missing bound is infinite. Raises `InputError` for bounds that do not
+    match the parameters or exclude the start."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
     if unknown := sorted(set(bounds) - set(start), key=str):
@@ -176,19 +177,20 @@ def evaluate(
     loss_if_diverged: float | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Return the losses of a problem at many points, in order, with the same bits for every executor.
+    """Return the losses of a problem at many points, in order. The results do not depend on the executor.
 
-    ``problem``: a `Problem`, also in other coordinates (`cortado.optimisation.transforms.Transformed`). ``points``: the
-    parameters of each point, by name. An iterator is read only as far as needed. ``gradient``: estimator of the
-    gradient, such as `gradients.Exact()`. Without an estimator, points are only run forward, and the gradient of an
-    `Estimate` is empty. ``executor``: see `cortado.executors`; by default points are computed one after the other in
-    this process. ``loss_if_diverged``: the loss, such as infinity, of a failed point, whose run diverges or whose
-    parameter is out of range; by default NaN, with a `CortadoWarning`. A failed point's gradient is NaN, and its
-    `Estimate.diverged` is the error. ``on_result``: called with the number and the `Estimate` of each computed point,
-    in any order.
+    Args:
+        problem: a `Problem`, or a `cortado.optimisation.transforms.Transformed` problem.
+        points: the parameters of each point, by name. An iterator is read only as far as needed.
+        gradient: estimator of the gradient, such as `gradients.Exact()`. Without an estimator, points are only run
+            forward, and the gradient of an `Estimate` is empty.
+        executor: see `cortado.executors`. By default points are computed one after the other in this process.
+        loss_if_diverged: the loss of a failed point, such as infinity. A point fails if its run diverges or if a
+            parameter is out of range. By default the loss is NaN, and a `CortadoWarning` is given.
+        on_result: function that is called with the number and the `Estimate` of each computed point, in any order.
 
-    Any other error of a point is raised. If all points fail, the error of the first point is raised, unless
-    ``loss_if_diverged`` is given.
+    The gradient of a failed point is NaN, and its `Estimate.diverged` is the error. Any other error of a point is
+    raised. If all points fail, the error of the first point is raised, unless ``loss_if_diverged`` is given.
 
     Example::
 
@@ -233,27 +235,32 @@ def optimise(
     on_iteration: Callable[[Record], None] | None = None,
     **settings: Any,
 ) -> Result:
-    """Lower the loss of a problem from first parameters on; `cortado.optimize` is the same function.
+    """Lower the loss of a problem, beginning at given parameters. `cortado.optimize` is the same function.
 
-    ``problem``: a `Problem`, or any object with `value_and_gradient`, or a function that takes the parameters by name
-    and returns the loss and its gradient, ``{"gravity": array of the parameter's shape}``. ``start``: first parameters
-    by name, numbers or arrays of any shape, optimised together in float64. ``optimiser``: an object such as
-    `cortado.optimisers.Adam(learning_rate=0.1)`, or "adam", "gradient_descent", "lbfgs" or "line_search" with settings
-    as keywords. ``settings``: settings of such an optimiser, as in ``optimise(problem, start, "adam",
-    learning_rate=0.1, iterations=50)``. ``iterations``: greatest number of updates; Adam and gradient
-    descent then evaluate the last iterate, too. ``bounds``: by name, (lower, upper), each a number, an array of the
-    parameter's shape, or None. ``gradient``: gradient estimator for the problem. ``checkpoint``: folder
-    for the replay log, to which every evaluation is written before the next evaluation begins. ``resume``: continue the
-    run in ``checkpoint`` with the same bits as without an interruption, or begin a new run in an empty folder. A
-    resumed run may have another number of ``iterations``. ``on_iteration``: called with the `Record` of every
-    evaluation, including those read from the checkpoint, but not of `LineSearch`'s trials.
+    Args:
+        problem: a `Problem`, any object with `value_and_gradient`, or a function. The function takes parameters by name
+            and returns the loss and its gradient, ``{"gravity": array of the parameter's shape}``.
+        start: first parameters by name, numbers or arrays of any shape. They are optimised together in float64.
+        optimiser: an object such as `cortado.optimisers.Adam(learning_rate=0.1)`, or "adam", "gradient_descent",
+            "lbfgs" or "line_search" with settings as keywords.
+        iterations: greatest number of updates. Adam and gradient descent also evaluate the last iterate.
+        bounds: lower and upper bound of each parameter by name. A bound is a number, an array in the shape of the
+            parameter, or None.
+        gradient: gradient estimator for the problem.
+        checkpoint: folder of the replay log. Every evaluation is written to it before the next one begins.
+        resume: continue the run in ``checkpoint``, or begin a new run in an empty folder. A resumed run gives exactly
+            the numbers of a run without interruption. The number of ``iterations`` may change.
+        on_iteration: function that is called with the `Record` of every evaluation. This includes evaluations that are
+            read from the checkpoint, but not the trials of `LineSearch`.
+        settings: settings of a named optimiser, as in
+            ``optimise(problem, start, "adam", learning_rate=0.1, iterations=50)``.
 
-    A step is refused if the run after the step diverges, or a parameter is out of range. Adam and gradient descent then
-    halve the step until it succeeds, and all later steps too. The line searches take shorter trials. `Result.refused`
+    A step is refused if its run diverges or if a parameter is out of range. Adam and gradient descent then halve the
+    step until it succeeds, and shorten all later steps too. The line searches take shorter trials. `Result.refused`
     counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
 
     Raises InputError for unsuitable ``start``, ``bounds`` or settings, and for a checkpoint of another run. Raises
-    DivergedError if the run at the start diverges, or after a step halved ten times. Raises ComputationError if a
+    DivergedError if the run at the start diverges, or after a step was halved ten times. Raises ComputationError if a
     parameter is out of range after ten halvings, or if the loss or gradient is not finite. Earlier evaluations stay in
     the checkpoint.
 
@@ -313,7 +320,7 @@ def optimise(
 
 
 optimize = optimise
-"""`optimise`, for users who spell it with a z."""
+"""American spelling of `optimise`."""
 
 
 def _description(setting: object) -> str:

@@ -1,7 +1,7 @@
-"""The optimisers: objects with settings and an algorithm.
+"""Optimisers: gradient descent, Adam, L-BFGS and a line search.
 
-The points that an optimiser evaluates may depend only on its settings and on earlier losses and gradients, because
-resuming a search replays them. Random numbers must come from a seed among the settings.
+The points that an optimiser evaluates must depend only on its settings and on earlier losses and gradients, because
+resuming a search replays them. Random numbers must come from a seed in the settings.
 """
 
 from collections.abc import Mapping
@@ -28,27 +28,27 @@ from cortado.optimisation.search import (
 )
 
 GROWTH = 3.0
-"""Longest trial of the line search, relative to the best length of the previous update."""
+"""Longest trial of the line search, relative to the best length in the previous update."""
 SMALL = 0.01
-"""L-BFGS has not ended at an optimum if the last gradient exceeds this part of the first gradient."""
+"""Greatest ratio of the last to the first gradient for which L-BFGS reports convergence."""
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
 
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam: steps along the mean of recent gradients, divided by the root mean square of recent gradients.
+    """Adam: steps along the mean of recent gradients, divided by their root mean square.
 
     A step changes a component by at most about the learning rate, for gradients of any size. Every update ends with a
     projection onto the bounds. If the run after a step diverges, Adam halves the step and the learning rate, at most 10
-    times, and restarts both means from 0. Adam has no convergence test: all iterations are made.
+    times, and restarts both means from 0. Adam has no convergence test and makes all iterations.
 
-    Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1.
-    Raises InputError for settings out of range.
+    Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1. Raises
+    InputError for settings out of range.
 
-    ``learning_rate``: a number, or a number per parameter by name [unit of the parameter]. ``beta1`` and ``beta2``:
-    decay of the mean gradient and of the mean squared gradient, in [0, 1) [-]. ``epsilon``: added to the root against
-    division by 0 [unit of the gradient].
+    ``learning_rate`` is a number, or one number for each parameter by name [unit of the parameter]. ``beta1`` and
+    ``beta2`` are the decay factors of the mean gradient and of the mean squared gradient, in [0, 1) [-]. ``epsilon`` is
+    added to the root to avoid a division by 0 [unit of the gradient].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.Adam(0.1), iterations=50)``
     """
@@ -70,7 +70,7 @@ class Adam:
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates with one gradient per update, and evaluate the last iterate."""
+        """Make `search.iterations` updates with one gradient each, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         theta = Iterate(search)
         m, v, t = np.zeros_like(theta.x), np.zeros_like(theta.x), 0
@@ -91,15 +91,16 @@ class Adam:
 class GradientDescent:
     """Gradient descent with a heavy ball: x_{k+1} = P(x_k - learning_rate g_k + momentum (x_k - x_{k-1})).
 
-    P projects onto the bounds. If the run after a step diverges, the step and the learning rate are halved, at most 10
-    times, and the momentum term restarts from 0. The method has no convergence test: all iterations are made.
+    x_k are the parameters after k updates, g_k is the gradient at x_k, and P projects onto the bounds. If the run after
+    a step diverges, the step and the learning rate are halved, at most 10 times, and the momentum term restarts from 0.
+    The method has no convergence test and makes all iterations.
 
-    Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR
-    Computational Mathematics and Mathematical Physics 4(5), 1964; plain gradient descent with momentum 0.
-    Raises InputError for settings out of range.
+    Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR Computational
+    Mathematics and Mathematical Physics 4(5), 1964. With momentum 0 it is plain gradient descent. Raises InputError for
+    settings out of range.
 
-    ``learning_rate``: a number, or a number per parameter by name [unit of the parameter^2 / unit of the loss].
-    ``momentum``: factor of the previous step, in [0, 1) [-].
+    ``learning_rate`` is a number, or one number for each parameter by name [unit of the parameter^2 / unit of the
+    loss]. ``momentum`` is the factor of the previous step, in [0, 1) [-].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.GradientDescent(0.01), iterations=50)``
     """
@@ -117,7 +118,7 @@ class GradientDescent:
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates with one gradient per update, and evaluate the last iterate."""
+        """Make `search.iterations` updates with one gradient each, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         at, before = Iterate(search), search.start
         for _ in range(search.iterations):
@@ -132,23 +133,22 @@ class LBFGS:
     """L-BFGS-B: a quasi-Newton method with bounds and a line search of one or more evaluations per iteration.
 
     L-BFGS finds accurate optima of smooth losses in few evaluations, but stops early if the gradient is noisy. The
-    coordinates are (x - start) / scale, and the loss is divided by the greatest component of the first gradient in
-    these coordinates. The first trial step is therefore at most about `scale` long, for any unit of the loss.
+    coordinates are (x - start) / scale for parameters x, and the loss is divided by the greatest component of the first
+    gradient in these coordinates. The first trial step is therefore at most about `scale` long, for any unit of the
+    loss.
 
-    If the run of a trial diverges, the next trial is about a quarter as long, because the line search gets values of a
-    parabola. The parabola has the loss and slope of the last iterate, and its minimum at a quarter of the step. A
-    diverged trial does not enter the approximate Hessian.
+    If the run of a trial diverges, the next trial is about a quarter as long. A diverged trial does not enter the
+    approximate Hessian.
 
-    With more than about 10^4 components the last bits of sums depend on the number of BLAS threads, so that resuming
-    needs the same number of threads. Resuming a run with different bits raises an error.
+    With more than about 10^4 components the last bits of sums depend on the number of BLAS threads. Resume a large
+    search with the same number of threads. If the numbers of a resumed run differ, an error is raised.
 
     Source: R. H. Byrd, P. Lu, J. Nocedal and C. Zhu, SIAM Journal on Scientific Computing 16(5), 1995, as in
-    `scipy.optimize.minimize(method="L-BFGS-B")`.
-    Raises InputError for settings out of range.
+    `scipy.optimize.minimize(method="L-BFGS-B")`. Raises InputError for settings out of range.
 
-    ``memory``: number of past updates in the approximate Hessian, at most 1,000. ``tolerance``: convergence threshold
-    for the greatest component of the projected gradient, relative to the first gradient [-]. ``scale``: typical change
-    of a parameter, a number or a number per parameter by name [unit of the parameter].
+    ``memory`` is the number of past updates in the approximate Hessian, at most 1,000. ``tolerance`` is the convergence
+    threshold for the greatest component of the projected gradient, relative to the first gradient [-]. ``scale`` is a
+    typical change of a parameter, as a number or as one number for each parameter by name [unit of the parameter].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LBFGS(scale=0.5), iterations=20)``
     """
@@ -172,7 +172,7 @@ class LBFGS:
         require({f"{self.memory:,} past updates": 8.0 * numbers}, "take fewer of them, by memory")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make at most `search.iterations` updates of one or more evaluations."""
+        """Make at most `search.iterations` updates, each with one or more evaluations."""
         from scipy.optimize import minimize
 
         scale = search.layout.spread(self.scale)
@@ -233,20 +233,19 @@ class LBFGS:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A point in L-BFGS's coordinates (size,), with loss and gradient (size,)."""
+    """A point in the coordinates of L-BFGS (size,), with its loss and gradient (size,)."""
 
     y: Vector
     loss: float
     gradient: Vector
 
     def rising(self, y: Vector) -> tuple[float, Vector]:
-        """Return a substitute loss and gradient at y, whose run diverged: values of the parabola f + s t - 2 s t^2 from
-        this point (t = 0, loss f, slope s < 0) to y (t = 1)."""
+        """Return a substitute loss and gradient at y, where the run diverged. They are values of a parabola with its
+        minimum at a quarter of the way to y."""
         return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
 def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vector) -> float:
-    """Return the greatest component of ``scale`` times the projected gradient."""
     outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
     return float(np.max(np.abs(np.where(outwards, 0.0, scale * gradient))))
 
@@ -256,25 +255,28 @@ class LineSearch:
     """Gradient descent whose step is the best of several trial lengths.
 
     Use `LineSearch` for rough losses, and for gradients with the right direction but a wrong size, as in long runs. The
-    search steps over local minima narrower than its trials, and never to a point whose run diverges or whose parameters
-    are out of range. A trial is a run without a gradient; all trials of an update form one batch.
+    search steps over local minima that are narrower than its trials. It never steps to a point whose run diverges or
+    whose parameters are out of range. A trial is a run without a gradient, and all trials of an update form one batch.
 
-    Formula: with g the gradient times the scale, and unit(a) = a over its root mean square,
+    Update k moves the parameters x_k along a direction d_k. With the gradient g_k times the scale, and with unit(a) = a
+    divided by its root mean square,
 
         d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
 
-    over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r is 1 at first, and
+    over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r_k is 1 at first, and
     later 3 times the best length, at most 1. If no trial lowers the loss, the update still takes the best trial and
-    sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one. If every trial
-    diverges, x stays, the momentum is set to 0, and the reach is multiplied by ``shortest``. If the gradient at the
-    best trial diverges, the step and the reach are shortened. The method has no convergence test: all iterations are
-    made.
+    sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one.
+
+    If every trial diverges, the parameters stay, the momentum is set to 0, and the reach is multiplied by ``shortest``.
+    If the gradient at the best trial diverges, the step and the reach are shortened. The method has no convergence test
+    and makes all iterations.
 
     Raises InputError for settings out of range.
 
-    ``scale``: longest change of a parameter in a trial, a number or a number per parameter by name [unit of the
-    parameter]. ``trials``: number of lengths per update, at most 1,000. ``shortest``: ratio of the shortest to the
-    longest length. ``momentum``: factor of the previous direction in the new direction, in [0, 1) [-].
+    ``scale`` is the longest change of a parameter in a trial, as a number or as one number for each parameter by name
+    [unit of the parameter]. ``trials`` is the number of lengths per update, at most 1,000. ``shortest`` is the ratio of
+    the shortest to the longest length. ``momentum`` is the factor of the previous direction in the new direction, in
+    [0, 1) [-].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LineSearch(scale=0.5), iterations=20)``
     """
@@ -302,7 +304,7 @@ class LineSearch:
         require({f"{self.trials:,} trials": 16.0 * self.trials * layout.size}, "take fewer trials")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates with one gradient per update, and evaluate the last iterate."""
+        """Make `search.iterations` updates with one gradient each, and evaluate the last iterate."""
         scale, at, reach = search.layout.spread(self.scale), Iterate(search), 1.0
         along = np.zeros_like(at.x)
         for _ in range(search.iterations):
@@ -331,7 +333,8 @@ BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "l
 
 
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """Return an optimiser from a name and settings, or the given optimiser; raise `InputError` for anything else."""
+    """Make an optimiser from a name and settings, or return a given optimiser. Raises `InputError` for any other
+    object."""
     if isinstance(optimiser, str):
         if optimiser not in BY_NAME:
             wanted = f"one of {quoted(BY_NAME)}, or an object"

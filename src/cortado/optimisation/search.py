@@ -1,7 +1,7 @@
-"""The interface between optimisers and problems, with all parameters in one vector, and the replay log of evaluations.
+"""The interface between optimisers and problems, and the replay log of evaluations.
 
 Optimisers are deterministic: with the losses and gradients of an earlier run they take the same steps. The replay log
-of all evaluations is therefore a checkpoint of any optimiser. The log is an append-only file, because sqlite3 databases
+of all evaluations is therefore a checkpoint of any optimiser. The log is an append-only file. An sqlite3 database would
 need locks, which file systems of clusters may lack.
 """
 
@@ -31,7 +31,7 @@ HALVINGS = 10
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Order and shapes of named parameters in the optimiser's vector; the shape of a number is ()."""
+    """The order and shapes of named parameters in the optimiser's vector. The shape of a number is ()."""
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
@@ -49,26 +49,26 @@ class ParameterLayout:
         return sum(self.sizes)
 
     def ravel(self, parameters: Mapping[str, Any]) -> Vector:
-        """Return the vector (size,) of parameters by name."""
+        """Return parameters by name as one vector (size,)."""
         parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
         return np.concatenate(parts)
 
     def unravel(self, vector: Vector) -> dict[str, Vector]:
-        """Return copies of the parameters in a vector (size,) by name; numbers become arrays of shape ()."""
+        """Return copies of the parameters in a vector (size,), by name. Numbers become arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
         return {
             name: part.reshape(shape).copy() for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
         }
 
     def spread(self, values: float | Mapping[str, float]) -> Vector:
-        """Expand a number, or a number per parameter, to a vector (size,)."""
+        """Expand a number, or one number for each parameter, to a vector (size,)."""
         by_name = values if isinstance(values, Mapping) else dict.fromkeys(self.names, values)
         return np.repeat([float(by_name[name]) for name in self.names], self.sizes)
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedEvaluation:
-    """An evaluation of the loss and its gradient (size,) at parameters (size,) in a replay log."""
+    """An entry of a replay log: the loss and its gradient (size,) at parameters (size,)."""
 
     parameters: Vector
     loss: float
@@ -79,7 +79,6 @@ class MemoryLog(list[LoggedEvaluation]):
     """A replay log in memory, which is lost when the process ends."""
 
     fate = "were not kept, as there is no checkpoint"
-    """End of the sentence "The evaluations ..." in messages."""
 
     def read(self, index: int) -> LoggedEvaluation:
         return self[index]
@@ -89,18 +88,19 @@ class MemoryLog(list[LoggedEvaluation]):
 
 
 class ReplayLog:
-    """A replay log in one file of a folder; a killed process loses at most the evaluation that it is writing.
+    """A replay log in one file of a folder. A killed process loses at most the evaluation that it is writing.
 
-    The file is a line of JSON (format, names, shapes, settings), and one record of fixed size per evaluation. A record
-    is little-endian: index (uint64), loss, parameters and gradient (float64), and the CRC-32 of all these (uint32).
-    Every record is on the disk before `append` returns. The next evaluation overwrites an incomplete last record.
+    The file is a line of JSON with the format, names, shapes and settings, followed by one record of fixed size per
+    evaluation. A record is little-endian. It consists of the index (uint64), the loss, parameters and gradient
+    (float64), and the CRC-32 of the preceding values (uint32). Every record is on the disk before `append` returns. The
+    next evaluation overwrites an incomplete last record.
     """
 
     def __init__(self, folder: Path | str, layout: ParameterLayout, settings: Mapping[str, str], resume: bool):
-        """Open the log of ``folder`` to ``resume`` a search, or begin a new log.
+        """Open the log in ``folder`` to ``resume`` a search, or begin a new log.
 
-        Raise `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ, or if a
-        record before the last one is damaged.
+        Raises `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ from the
+        settings in the log, or if a record before the last one is damaged.
         """
         path, self._size, self._record_size = Path(folder) / REPLAY_LOG, layout.size, 8 + 8 * (1 + 2 * layout.size) + 4
         self._path, self.fate = path, f"are in '{path}'"
@@ -136,7 +136,7 @@ class ReplayLog:
         return LoggedEvaluation(values[1 : 1 + self._size], float(values[0]), values[1 + self._size :])
 
     def append(self, evaluation: LoggedEvaluation) -> None:
-        """Write an evaluation to the disk; raise `ComputationError` if writing fails."""
+        """Write an evaluation to the disk, or raise `ComputationError`."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = self._count.to_bytes(8, "little") + values.astype("<f8").tobytes()
         try:
@@ -154,7 +154,7 @@ class ReplayLog:
         self._file.close()
 
     def _count_complete(self) -> int:
-        """Count the complete records; raise `InputError` if a record before the last one is damaged."""
+        """Count the complete records. Raises `InputError` if a record before the last one is damaged."""
         records, complete = (self._file.seek(0, os.SEEK_END) - self._first_record) // self._record_size, 0
         self._file.seek(self._first_record)
         while len(record := self._file.read(self._record_size)) == self._record_size:
@@ -174,7 +174,7 @@ Log = MemoryLog | ReplayLog
 
 
 def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> None:
-    """Read the first line of a log; raise `InputError`, naming the parts between semicolons that differ."""
+    """Read the first line of a log. Raises `InputError` if it differs from ``header``."""
     try:
         found = parsed_json(file.readline(2**20))  # a damaged file may have no line end
     except ValueError:
@@ -196,28 +196,27 @@ def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> None
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """The problem for an optimiser, as a function of one vector."""
+    """The problem for an optimiser, as a function of one vector that contains all parameters."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Function from a vector (size,) to the loss and the gradient (size,); an error of the run ends the search."""
+    """Function that maps a vector (size,) to the loss and the gradient (size,). It raises the error of a failed run."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
-    """Function from a vector (size,) to the loss and the gradient (size,), or to None if the run diverges or a
-    parameter is out of range. The search counts and survives a None."""
+    """Function that maps a vector (size,) to the loss and the gradient (size,). It returns None if the run diverges or
+    if a parameter is out of range."""
     losses: Callable[[Sequence[Vector]], list[float]]
-    """Function from several vectors (size,) to their losses, infinite if the run diverges or parameters are out of
-    range. Losses alone are cheaper than `evaluate`."""
+    """Function that maps several vectors (size,) to their losses without gradients. The loss is infinite if the run
+    diverges or if a parameter is out of range."""
     layout: ParameterLayout
-    """Assignment of the vector's components to parameters."""
+    """Order and shapes of the parameters in the vector."""
     start: Vector
     """First vector (size,), within the bounds."""
     lower: Vector
-    """Lower bounds (size,); -inf without a bound."""
+    """Lower bounds (size,), -inf without a bound."""
     upper: Vector
-    """Upper bounds (size,); +inf without a bound."""
+    """Upper bounds (size,), +inf without a bound."""
     iterations: int
-    """Greatest number of updates."""
     updated: Callable[[], None] = lambda: None
-    """Called after each update, to count updates."""
+    """Function that the optimiser calls after each update."""
 
     def project(self, vector: Vector) -> Vector:
         """Return the nearest vector within the bounds."""
@@ -226,14 +225,14 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of an optimiser: its last iterate, and the end of the search."""
+    """The result of an optimiser: its last iterate, and how the search ended."""
 
     last: Vector
     """Last iterate (size,), which has been evaluated."""
     converged: bool
     """True if the optimiser's convergence test was met."""
     message: str
-    """Sentence about the end of the search."""
+    """Sentence on how the search ended."""
 
 
 @runtime_checkable
@@ -241,14 +240,13 @@ class Optimiser(Protocol):
     """An algorithm that lowers the loss."""
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the settings do not fit these parameters."""
+        """Raise `InputError` if the settings do not match the parameters."""
 
     def minimise(self, search: Search) -> Outcome:
         """Lower the loss by at most `search.iterations` updates."""
 
 
 def require_positive(name: str, values: PerParameter) -> None:
-    """Raise `InputError` unless every number is positive and finite."""
     for value in values.values() if isinstance(values, Mapping) else [values]:
         number = as_number(value)
         if number is None or number <= 0.0:
@@ -256,14 +254,13 @@ def require_positive(name: str, values: PerParameter) -> None:
 
 
 def require_fraction(name: str, value: float) -> None:
-    """Raise `InputError` unless a number is in [0, 1)."""
     number = as_number(value)
     if number is None or not 0.0 <= number < 1.0:
         raise InputError(f"{name} must be a number in [0, 1), not {shown(value)}.")
 
 
 def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
-    """Raise `InputError` if a setting by name has a name that is no parameter."""
+    """Raise `InputError` if ``values`` has a name that is not a parameter."""
     if isinstance(values, Mapping) and set(values) != set(layout.names):
         raise InputError(
             f"{name} is given for {quoted(values)}, but the optimised parameters are "
@@ -272,15 +269,15 @@ def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> N
 
 
 class Iterate:
-    """The current, evaluated point of an optimiser."""
+    """The current point of an optimiser."""
 
     def __init__(self, search: Search):
         self._search, self.x = search, search.start
         self.loss, self.gradient = search.evaluate(search.start)
 
     def move(self, target: Vector) -> float:
-        """Move to a vector (size,); while the run there fails, halve the step. Return the fraction of the step that was
-        taken, or raise the error of the shortest step."""
+        """Move to a vector (size,). If the run there fails, the step is halved until a run succeeds. Return the
+        fraction of the step that was taken, or raise the error of the shortest step."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)

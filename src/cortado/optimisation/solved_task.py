@@ -1,4 +1,4 @@
-"""Plots, pictures and films of a solved task, and the input of ``cortado fit``: scenes with measured data."""
+"""Plots, pictures and films of a solved task, and the input of ``cortado fit``, which is a scene with measured data."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -37,11 +37,11 @@ from cortado.scene.tables import MISSING, Table
 from cortado.simulation import Simulation
 
 MOST_CURVES = 12
-"""Greatest number of components for which a parameter gets its own picture."""
+"""Greatest number of components for which each parameter gets a separate plot."""
 TITLES = ("first guess", "found", "target")
 IMAGES = 6
 EVALUATIONS = (1, 5, 20, 100)
-"""Numbers of the evaluations whose runs are shown; 0 is the start."""
+"""Numbers of the evaluations that are shown. The start has number 0."""
 Run = Mapping[int, Snapshot]
 
 
@@ -58,17 +58,16 @@ class TaskFigures:
 
 @dataclass(frozen=True)
 class KnotValues:
-    """Values of a parameter at k knots in time, with linear interpolation between them."""
+    """Values of a parameter over time at k knots, with linear interpolation between knots."""
 
     times: np.ndarray
-    """(k,) [s] The first knot is half a step after the start of the run, because a step uses the value at its middle;
-    for positions one step."""
+    """Times of the knots (k,) [s]."""
     start: np.ndarray
-    """Values at the start of the search (k, d), or (k,) for numbers, in the unit of the parameter."""
+    """Values at the start of the search, (k, d) or (k,), in the unit of the parameter."""
     estimate: np.ndarray
-    """Found values (k, d), in the unit of the parameter."""
+    """Found values, (k, d) or (k,), in the unit of the parameter."""
     true: np.ndarray | None
-    """Values (k, d) that approximate the true parameter over time best; None if the target is a picture."""
+    """Best approximation of the true parameter, (k, d) or (k,). None if the target is a picture."""
 
     def for_machines(self) -> dict[str, np.ndarray]:
         known = {} if self.true is None else {"true": self.true}
@@ -76,7 +75,7 @@ class KnotValues:
 
 
 def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndarray]) -> dict[str, KnotValues]:
-    """Return by name the searched parameters that are interpolated between knots."""
+    """Return the values at knots of all searched parameters over time, by name."""
     step = float(estimate.get("time_step", made.task.scene.solver.time_step))
     found = {}
     for name, bijector in made.search.coordinates.items():
@@ -145,7 +144,7 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
 
 
 def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
-    """Name the components of a parameter, or of a row of a parameter over time, by axes, phases, or numbers."""
+    """Return names of the components of a parameter: axes, phases, or numbers."""
     scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")
@@ -224,7 +223,7 @@ class MeasuredScene:
     problem: tables.ProblemTable
 
     def experiment(self, device: str, precision: str) -> Experiment:
-        """Make the experiment on a device; raise `InputError` or `SceneError` for unsuitable or unreadable data."""
+        """Make the experiment on a device. Raises `InputError` or `SceneError` if the data cannot be read or used."""
         simulation, folder = Simulation(self.scene, device, precision), Path(self.file).parent
         last = self.problem.steps * float(self.scene.solver.time_step)
         found = {}
@@ -247,7 +246,7 @@ class FitTask:
 
 
 def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> FitTask:
-    """Read a task of `cortado fit` from a TOML file; raise `SceneError` if it is invalid."""
+    """Read a task of `cortado fit` from a TOML file, or raise `SceneError`."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("optimise", "dataset"))
     if "fit" not in data:
@@ -275,7 +274,8 @@ def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[Measured
 
 
 def observation(table: tables.AnyMeasured, simulation: Simulation, folder: Path, last: float) -> Observation:
-    """Make the observation of a table, up to the ``last`` time of the run [s]; raise `InputError`."""
+    """Make the observation of a table of measured data. ``last`` is the end time of the run [s]. Raises
+    `InputError`."""
     kinds: dict[str, Any] = {"video": _video, "sensor": _series, "tracks": _tracks}
     made: Observation = kinds[table.kind](table, simulation, folder, last)
     return made

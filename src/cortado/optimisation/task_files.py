@@ -33,26 +33,25 @@ _ALGORITHMS = {
 }
 DRAWN = {"heart": heart, "rosetta": rosetta}
 GIVEN = Words("given")
-"""The value that a message shows for a key that should be left out."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """An inverse problem: a scene, a target, and a search. Parameters over time have one row per step."""
+    """An inverse problem, with a scene, a target, and a search. Parameters over time are stored for each time step."""
 
     scene: Scene
     problem: ProblemTable
     optimise: OptimiseTable
     true_parameters: Arrays
-    """Parameters of the run that made the target; empty if the target is a picture."""
+    """Parameters of the run that made the target. Empty if the target is a picture."""
     start: dict[str, Any]
     known: Known
     folder: Path = Path()
-    """The folder of the task's file; paths in the task are relative to it."""
+    """Folder of the task's file, to which paths in the task are relative."""
 
 
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
-    """Read a task from a TOML file; raise `SceneError` if it is invalid."""
+    """Read a task from a TOML file, or raise `SceneError`."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("fit", "dataset"))
     scene = scene_from_dict(data, file)
@@ -85,7 +84,7 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
 
 
 def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Table]) -> tuple[Known, Any]:
-    """Return the scene's parameters, and the tables of a ``model`` checked against them; raise `SceneError`."""
+    """Return the parameters of the scene, and the tables of a task, which must match the scene. Raises `SceneError`."""
     try:
         known = known_in(scene)
         names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
@@ -99,7 +98,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Check values by parameter, and interpolate rows over time to one row per step; raise `SceneError`."""
+    """Check values by parameter name, and interpolate values over time to all time steps. Raises `SceneError`."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]
@@ -137,7 +136,7 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
-    """Raise `SceneError` for an option that contradicts others or has no effect."""
+    """Raise `SceneError` for an option that contradicts another option or that has no effect."""
     over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
@@ -173,7 +172,7 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
 def _check_bounds(
     name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene, known: Known
 ) -> None:
-    """Raise `SceneError` for bounds that are invalid, or exclude the start."""
+    """Raise `SceneError` for bounds that are invalid or exclude the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
         raise SceneError(None, field, GIVEN, "left out, as optimise.start lacks it")
@@ -247,17 +246,17 @@ def _listed(words: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Setup:
-    """A task on a device: the arguments for `cortado.optimise`, and the target."""
+    """The arguments of `cortado.optimise` for a task on a device."""
 
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """One search for each entry of the extinction schedule, in the same coordinates."""
+    """Searches, one for each entry of the extinction schedule."""
     start: Arrays
     bounds: dict[str, tuple[Any, Any]]
-    """Bounds of coordinates by name, of knots or logarithms; not negative parameters have the lower bound 0."""
+    """Bounds of the coordinates, by parameter name."""
     renderer: Renderer | None
-    """Renderer of the compared pictures; None if positions are compared."""
+    """Renderer of the compared pictures, or None if positions are compared."""
     targets: dict[int, np.ndarray]
     """Target images (rows, columns, 3) or positions (n, d) [m] by number of steps."""
 
@@ -274,7 +273,7 @@ class Setup:
 
 
 def setup(task: Task, device: str, precision: str) -> Setup:
-    """Set up a task on a device; raise `InputError` for a picture that cannot be read."""
+    """Set up a task on a device. Raises `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     settings, searches = task.optimise, []

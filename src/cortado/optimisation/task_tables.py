@@ -42,7 +42,8 @@ ESTIMATORS: dict[str, AdjointEstimator] = {"exact": Exact(), "adjoint_viscosity"
 
 
 def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Convert values to arrays by parameter name; parameters in `CAN_BE_RANDOM` may instead be one of ``words``."""
+    """Convert values to arrays by parameter name. Values of parameters in `CAN_BE_RANDOM` may also be one of
+    ``words``."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
     names, flat = _names(info), dict[str, Any]()
@@ -70,14 +71,13 @@ def _offered(info: ValidationInfo) -> str:
 
 
 def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-    """Check a parameter's name against the names in the validation context, if there are any."""
+    """Check that a scene has the parameter with this name."""
     if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
     return name if info.context else check(name)
 
 
 def _is_numeric(value: Any) -> bool:
-    """Test for a finite number, or a non-empty (nested) list of finite numbers."""
     if isinstance(value, list):
         return bool(value) and all(map(_is_numeric, value))
     return as_number(value) is not None
@@ -96,11 +96,11 @@ def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
 
 VALUES = _schema()
 Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(VALUES)]
-"""Parameters by name, each a number, a list of numbers, or a list of lists of numbers."""
+"""Parameters by name. Each is a number, a list of numbers, or a list of lists of numbers."""
 Start = Annotated[
     dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
 ]
-"""`Values` in which first positions and mass fractions may be the word "random"."""
+"""`Values` that may be the word "random" for first positions and mass fractions."""
 ParameterName = Annotated[str, OneOf(NAMES), WrapValidator(_known)]
 
 
@@ -108,63 +108,65 @@ class MeasuredTable(Table):
     """A measurement of an experiment."""
 
     name: Text
-    """Name of the measurement in results, and prefix of its camera's parameters, as in "camera.rotation"."""
+    """Name of the measurement in results, and prefix of the parameters of its camera, as in "camera.rotation"."""
     file: Text
     """File with the measured data, relative to the folder of the task's file."""
     start: Seconds = 0.0
-    """Time of the run at which the file's times are 0."""
+    """Time of the run at time 0 of the file."""
 
 
 class VideoTable(MeasuredTable):
-    """Frames of a video, compared with pictures of the simulation by the camera of the table [render]."""
+    """Frames of a video, which are compared with pictures of the simulation. The table [render] sets the camera."""
 
     kind: Literal["video"]
-    """Frames, compared with pictures."""
+    """The measurements are frames of a video."""
     frame_rate: Annotated[float, quantity("1/s", gt=0.0)] | None = None
-    """Frames per second; by default the video's frame rate. Needed for a folder of pictures."""
+    """Frames per second; by default the frame rate of the video. A folder of pictures needs this key."""
     every: Annotated[int, count(1, 1_000_000)] = 1
     """Use only every n-th frame."""
     crop: Annotated[tuple[Pixel, ...], components("left", "top", "right", "bottom")] | None = None
-    """Rectangle of each frame that is compared, in pixels of the frame; by default the full frame."""
+    """Compared rectangle of each frame, in pixels of the frame; by default the whole frame."""
     mask: Text | None = None
-    """Picture of the frames' size whose black pixels are ignored, relative to the folder of the task's file."""
+    """Picture whose black pixels are ignored, in the size of the frames. Its path is relative to the folder of the
+    task's file."""
     calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
-    """Camera parameters, extinction of the fluid, or clock ("start", the key start) that are fitted too."""
+    """Quantities that are fitted in addition: parameters of the camera, the extinction of the fluid, or "start" for the
+    time in the key start."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
-    """Standard deviation of the linear light of a pixel; by default estimated from the residuals."""
+    """Standard deviation of the linear light of a pixel; by default it is estimated from the residuals."""
 
 
 class SensorSeriesTable(MeasuredTable):
-    """Readings of a sensor: a CSV file with a column "time" [s], and columns named like the sensor's numbers. Columns
-    may be named as in `sensors.csv`, such as "gauge.height [m]"; columns of other sensors are ignored."""
+    """Readings of a sensor in a CSV file with a column "time" [s] and a column for each number of the sensor. Columns
+    may be named as in `sensors.csv`, such as "gauge.height [m]". Columns of other sensors are ignored."""
 
     kind: Literal["sensor"]
-    """A series, compared with a [[sensor]] of the scene; a "wave_gauge" predicts heights of a surface."""
+    """The measurements are readings of a [[sensor]] over time."""
     sensor: Text
-    """Name of the [[sensor]]."""
+    """Name of the [[sensor]] in the scene."""
     calibrate: Clock = ()
-    """["start"] fits the key start too."""
+    """["start"] to fit the time in the key start too."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
-    """Standard deviation of a number, in its unit; by default estimated from the residuals."""
+    """Standard deviation of a reading, in its unit; by default it is estimated from the residuals."""
 
 
 class TracksTable(MeasuredTable):
-    """Paths of tracers: a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. Every
-    tracer needs a line for the start of the run."""
+    """Paths of tracers in a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. Every
+    tracer needs a line at the start of the run."""
 
     kind: Literal["tracks"]
-    """Tracers, which swim with the fluid around them."""
+    """The measurements are paths of tracers, which move with the fluid."""
     calibrate: Clock = ()
-    """["start"] fits the key start too."""
+    """["start"] to fit the time in the key start too."""
     noise: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Standard deviation of a coordinate [m]; by default estimated from the residuals."""
+    """Standard deviation of a coordinate [m]; by default it is estimated from the residuals."""
 
 
 AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(discriminator="kind")]
 
 
 def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
-    """Return the factors of a continuation schedule; raise a `field_error` unless they increase to 1."""
+    """Return the factors of a continuation schedule. Raises a `field_error` unless they increase to 1."""
     with suppress(ValidationError):
         factors = check(value)
         if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
@@ -177,25 +179,28 @@ Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapVa
 
 
 class ProblemTable(Table):
-    """[problem]: a number of steps, and a target: the end of a run with true parameters, or a picture."""
+    """[problem]: the number of time steps and the target. The target is a picture, or the end of a run with true
+    parameters."""
 
     steps: Annotated[int, count(0, 10_000_000)]
-    """Time steps; 0 for a loss of the first state."""
+    """Number of time steps; 0 for a loss of the first state."""
     loss: Literal["positions", "image"] = "positions"
-    """Compare positions of particles, or images, with the target."""
+    """What is compared with the target: positions of particles or images."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
-    """Distance between images: their squared difference, or a pyramid, for shapes that do not overlap yet."""
+    """Distance between images: the squared difference, or an image pyramid for shapes that do not overlap at
+    the start."""
     frames: Annotated[int, count(1, 10_000)] = 1
-    """Number of states that are compared, evenly spaced up to the last one."""
+    """Number of compared states, evenly spaced up to the last state."""
     target: Values | None = None
-    """True parameters by name: the target is the result of a run with them. Either target or picture is needed."""
+    """True parameters by name. The target is the result of a run with these parameters. Either target or picture is
+    needed."""
     picture: Text | None = None
     """"heart", "rosetta", or a picture file, relative to the folder of the task's file."""
     measured: tuple[AnyMeasured, ...] = ()
-    """Measurements of an experiment, in place of a target or a picture; for `cortado fit`."""
+    """Measurements of an experiment, which replace the target or picture in `cortado fit`."""
     also: tuple[Text, ...] = ()
-    """Files of other experiments with the same fluid, relative to the folder of the task's file, for `cortado fit`:
-    scenes with a table [problem] of measured data."""
+    """Files of other experiments with the same fluid, for `cortado fit`. Each file is a scene with measured data in a
+    table [problem]. Paths are relative to the folder of the task's file."""
 
     @model_validator(mode="after")
     def _check_measured(self) -> Self:
@@ -235,30 +240,30 @@ class ProblemTable(Table):
 
 
 class CheckTable(Table):
-    """[optimise.check]: criteria that the estimate has to meet."""
+    """[optimise.check]: criteria that the estimate must meet."""
 
     loss_reduction: Annotated[float, quantity(ge=1.0)] = 1.0
-    """First loss / best loss."""
+    """Least ratio of the first loss to the best loss."""
     parameter_error: Annotated[float, quantity(gt=0.0)] = 1e50
-    """Greatest allowed relative distance (L2) of an estimated parameter from its true value."""
+    """Greatest allowed relative error (L2) of an estimated parameter."""
     psnr: Annotated[float, quantity("dB", ge=0.0)] = 0.0
     """Least peak signal-to-noise ratio between the image of the estimate and the target image."""
 
 
 class GradientTable(Table):
-    """[optimise.gradient]: which gradient the search follows, see docs/gradients.md."""
+    """[optimise.gradient]: the gradient estimator of the search; see docs/gradients.md."""
 
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
-    """Name of the estimator; "adjoint_viscosity" is for long splashes."""
+    """Name of the estimator. "adjoint_viscosity" suits long splashes."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
-    """C of `AdjointViscosity`, whose strength is C times the strain of the fluid in a step; by default 2."""
+    """Coefficient C of `AdjointViscosity`, whose strength is C times the strain in a step; by default 2."""
     samples: Annotated[int, count(1, 10_000)] = 1
-    """Runs of the ensemble over which the gradient is averaged: 1, or an even number of at least 4."""
+    """Number of runs over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
-    """Width of the ensemble for every searched parameter by name, in the units of its knots or logarithms; needed with
-    several samples. Samples may be out of bounds: make parameters logarithmic that must stay positive."""
+    """Width of the ensemble for every searched parameter by name, in the units of its knots or logarithms. Several
+    samples need this key. Samples may be out of bounds; search positive parameters by their logarithm."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
-    """Standard deviation of the perturbations of first positions in the ensemble."""
+    """Standard deviation by which first positions are perturbed in the ensemble."""
 
     @model_validator(mode="before")
     @classmethod
@@ -285,7 +290,7 @@ class GradientTable(Table):
         return self
 
     def estimator(self, executor: Executor | None = None) -> GradientEstimator:
-        """Make the gradient estimator of the table; ``executor`` computes the samples of an ensemble."""
+        """Make the gradient estimator of the table. ``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
         if isinstance(one, AdjointViscosity):
             coefficient = one.coefficient if self.coefficient is None else self.coefficient
@@ -298,33 +303,35 @@ class GradientTable(Table):
 
 
 class OptimiseTable(Table):
-    """[optimise]: the start of the search, its algorithm, and its length."""
+    """[optimise]: the start, the algorithm and the length of the search."""
 
     start: Start
-    """First values of the searched parameters by name; first positions and mass fractions may be the word "random"."""
+    """First values of the searched parameters by name. First positions and mass fractions may be the word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
-    """Number of knots in time between which parameters over time are interpolated; by default one row per step."""
+    """Number of knots in time for the linear interpolation of parameters over time. By default every time step has a
+    separate value."""
     logarithmic: tuple[ParameterName, ...] = ()
     """Parameters that are searched by their logarithm."""
     bounds: Values | None = None
-    """Lower and upper bound by parameter name; viscosity, mobility and fractions never become negative anyway."""
+    """Lower and upper bound by parameter name. Viscosity, mobility and fractions never become negative, with or without
+    bounds."""
     extinction_schedule: Schedule = (1.0,)
-    """A continuation schedule of searches. Each search multiplies the scene's extinction by one factor, and starts at
-    the end of the previous search. Pictures of thinner fluid show what is behind its surface."""
+    """Factors of successive searches. Each search multiplies the scene's extinction by one factor, and starts at the
+    end of the previous search. Pictures of thinner fluid show more of the fluid behind its surface."""
     optimiser: Annotated[str, OneOf(BY_NAME)] = "adam"
-    """Name of the algorithm; the line search of "lbfgs" needs exact gradients."""
+    """Name of the algorithm. The line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """Approximate step size of Adam, first step size of L-BFGS, or greatest step size of the line search, in units of
-    the parameters. Gradient descent multiplies the gradient by it."""
+    the parameters. For gradient descent it is the factor of the gradient."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
-    """L-BFGS ends if the gradient is smaller than this part of the first gradient; by default, if round-off stops
-    it."""
+    """L-BFGS ends when the gradient is smaller than this fraction of the first gradient. By default it ends when
+    round-off errors prevent further progress."""
     iterations: Annotated[int, count(1, MOST_ITERATIONS)]
     """Greatest number of updates of each search."""
     gradient: GradientTable = GradientTable()
-    """Gradient that the search follows."""
+    """Gradient estimator of the search."""
     check: CheckTable = CheckTable()
-    """Criteria that the estimate has to meet."""
+    """Criteria that the estimate must meet."""
 
     @model_validator(mode="after")
     def _check_tolerance(self) -> Self:
@@ -348,24 +355,25 @@ class TaskTables(Table):
 
 
 class FitTable(Table):
-    """[fit]: the parameters that are fitted to measured data, and the length of the fit."""
+    """[fit]: the fitted parameters and the length of the fit."""
 
     start: Values
-    """First values of the fitted parameters by name; positive parameters are searched by their logarithm."""
+    """First values of the fitted parameters by name. Positive parameters are searched by their logarithm."""
     bounds: Values | None = None
-    """Lower and upper bound by parameter name; a number with equal bounds is not fitted."""
+    """Lower and upper bound by parameter name. A number with equal bounds is kept fixed."""
     iterations: Annotated[int, count(1, 10_000)] = 50
-    """Greatest number of trial points of each of the two fits: the first weights all residuals equally, the second by
-    the noise that the first finds."""
+    """Greatest number of trial points of each of the two fits. The first fit gives all residuals equal weights. The
+    second fit uses weights from the noise that the first fit found."""
     starts: Annotated[int, count(1, 100)] | None = None
-    """Number of starts of the fit; by default 1, and three more if the first fit ends in doubt. Further starts lie
-    within the bounds, or within two decades of a positive number."""
+    """Number of starts of the fit. By default it is 1, with three more if the result of the first fit is doubtful.
+    Further starts lie within the bounds, or within two decades of a positive number."""
     profiles: Annotated[int, count(0, 100)] = 7
-    """Number of points of each fitted number's profile, with a fit of all other numbers at each point; 0 for none."""
+    """Number of points in the profile of each fitted number; 0 for no profiles. At each point all other numbers are
+    fitted."""
 
 
 class FitTables(Table):
-    """The tables [problem] and [fit] of a task whose target was measured."""
+    """The tables [problem] and [fit] of a task with measured data."""
 
     problem: ProblemTable
     fit: FitTable

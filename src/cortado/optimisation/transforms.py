@@ -1,7 +1,7 @@
 """Transforms of parameters, and problems with fixed parameters.
 
-A transform p(u) maps unconstrained coordinates u to a valid parameter: fractions that sum to 1, a positive number, or
-values over time between knots.
+A transform p(u) maps unconstrained coordinates u to a valid parameter p, such as fractions that sum to 1, a positive
+number, or values over time that are interpolated between knots.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,25 +22,26 @@ from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Arrays, Values, check_known, require_points
 
 SMALLEST = 1e-4
-"""Least fraction for which `Softmax` computes a coordinate, because the coordinate of 0 is minus infinity."""
+"""Lower limit of fractions in `Softmax.coordinate`."""
 
 
 class Bijector(Protocol):
-    """A smooth map p(u) with its inverse and its adjoint."""
+    """A smooth map p(u) from coordinates u to a parameter p, with its inverse and its adjoint."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         """Return the parameter p(u) at coordinates u."""
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """Return the u for which p(u) is nearest to ``parameter``."""
+        """Return the coordinates u whose parameter p(u) is nearest to ``parameter``."""
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the derivative of a loss with respect to u from ``bar``, the derivative with respect to p(u)."""
+        """Return the derivative of a loss with respect to u. ``bar`` is the derivative of the loss with respect to
+        p(u)."""
 
 
 @dataclass(frozen=True)
 class Logarithm:
-    """The transform p = exp(u) for positive parameters: a step in u multiplies p."""
+    """The transform p = exp(u) for positive parameters p."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         with np.errstate(over="ignore"):  # a problem refuses a parameter that is not finite
@@ -58,7 +59,8 @@ class Logarithm:
 
 @dataclass(frozen=True)
 class Softmax:
-    """The transform p_k = exp(u_k) / sum_l exp(u_l) of each row to fractions (n, phases) that add up to 1."""
+    """The transform p_k = exp(u_k) / sum_l exp(u_l) of coordinates u (n, phases) to fractions p (n, phases) that sum to
+    1."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return softmax(_shaped("coordinates", u, lambda shape: len(shape) == 2, "a row for each particle"), axis=1)
@@ -75,7 +77,7 @@ class Softmax:
 
 @dataclass(frozen=True)
 class TimeInterpolation:
-    """Linear interpolation p (steps, d) between knots u (k, d) at even times from the first to the last step."""
+    """Linear interpolation of values p (steps, d) between values u (k, d) at knots, which are evenly spaced in time."""
 
     steps: int
     knots: int
@@ -86,7 +88,7 @@ class TimeInterpolation:
 
     @property
     def places(self) -> np.ndarray:
-        """Return the times (k,) of the knots in steps, counted from 0; knots may lie between steps."""
+        """Return the times of the knots (k,) in time steps, counted from 0."""
         return np.linspace(0.0, self.steps - 1.0, self.knots)
 
     @property
@@ -108,17 +110,18 @@ class TimeInterpolation:
 
 @fixed
 class Affine:
-    """The transform p = base + matrix u, for example for accelerations of a tank with a fixed end position."""
+    """The transform p = base + matrix u of coordinates u, for example for accelerations of a tank with a fixed end
+    position."""
 
     def __init__(self, base: Any, matrix: Any):
-        """Store a ``base`` with the parameter's shape and unit, and a ``matrix`` of shape (*base.shape, *u.shape)."""
+        """Store ``base``, in the shape and unit of the parameter, and a ``matrix`` of shape (*base.shape, *u.shape)."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
 
     def __repr__(self) -> str:
-        """Return a text with a checksum of the numbers, which a resumed search compares."""
+        """Return a text with a checksum of the numbers."""
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
@@ -126,7 +129,7 @@ class Affine:
         return self.base + np.tensordot(self.matrix, coordinates, len(self._shape))
 
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
-        """Return the least-norm u for which p(u) is nearest to ``parameter``."""
+        """Return the coordinates u of least norm whose parameter p(u) is nearest to ``parameter``."""
         offset = _shaped("values", parameter, self.base.shape.__eq__, self.base.shape) - self.base
         matrix = self.matrix.reshape(self.base.size, -1)
         return np.linalg.lstsq(matrix, offset.ravel(), rcond=None)[0].reshape(self._shape)
@@ -140,35 +143,36 @@ class Affine:
 
 
 class OtherParameters:
-    """Base class of problems that are functions of other parameters than the original ``problem``."""
+    """Base class of problems with parameters that are converted to the parameters of an original ``problem``."""
 
     problem: Problem
 
     def parameters(self, u: Values) -> Values:
-        """Return the parameters of the original problem by name."""
+        """Convert parameters of this problem to parameters of the original problem."""
         raise NotImplementedError
 
     def value(self, u: Values) -> Any:
         return self.problem.value(self.parameters(u))
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return the greatest number of points in a batch, see `Batchable.room`."""
+        """Return the greatest number of points in a batch. See `Batchable.room`."""
         return self.problem.room(estimator)
 
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """Estimate losses and gradients at several points in one batch, see `Batchable.together`."""
+        """Estimate losses and gradients at several points in one batch. See `Batchable.together`."""
         require_points(points)
         return self.problem.together([self.parameters(u) for u in points], estimator)
 
 
 @fixed
 class Transformed(OtherParameters):
-    """A problem as a function of coordinates of some parameters, and of all other parameters unchanged."""
+    """A problem as a function of coordinates of some parameters. The remaining parameters are unchanged."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
-        """Store a ``problem`` and bijectors ``coordinates`` by name; raise `InputError` for unknown parameters."""
+        """Store a ``problem``, and a bijector for each parameter in ``coordinates``. Raises `InputError` for unknown
+        parameters."""
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
@@ -187,13 +191,13 @@ class Transformed(OtherParameters):
         return f"{self.problem.fingerprint}; coordinates {sorted(self.coordinates.items(), key=str)}"
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
-        """Return the parameters p(u) by name."""
+        """Convert coordinates u to parameters p(u) by name."""
         require_table("u", u, "{'viscosity': value}")
         known = {name: as_numbers(f"coordinate of {name}", u[name]) for name in self.coordinates.keys() & u.keys()}
         return {**u, **{name: self.coordinates[name].parameter(value) for name, value in known.items()}}
 
     def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
-        """Return the coordinates u by name."""
+        """Convert parameters to coordinates u by name."""
         require_table("parameters", parameters, "{'viscosity': value}")
         names = self.coordinates.keys() & parameters.keys()
         known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
@@ -209,17 +213,18 @@ class Transformed(OtherParameters):
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Estimate loss and gradient at coordinates u; an ensemble's spread has the units of the coordinates."""
+        """Estimate the loss and the gradient at coordinates u. The spread of an ensemble is in the units of the
+        coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
-        """Run the problem forward at coordinates u, before backward passes."""
+        """Run the problem forward at coordinates u."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """Estimate losses and gradients at several coordinates in one batch, see `Batchable.together`."""
+        """Estimate losses and gradients at several coordinates in one batch. See `Batchable.together`."""
         found = super().together(points, estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):
@@ -228,7 +233,7 @@ class Transformed(OtherParameters):
 
 
 class TransformedPass:
-    """A forward pass whose backward pass returns derivatives with respect to coordinates."""
+    """A forward pass at coordinates. Its backward pass returns derivatives with respect to the coordinates."""
 
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u
@@ -252,15 +257,14 @@ def by_coordinates(coordinates: Mapping[str, Bijector], u: Mapping[str, Any], gr
 
 
 class FixedParameters(OtherParameters):
-    """A problem as a function of the parameters that are not fixed; ensembles perturb the fixed first positions."""
+    """A problem with some parameters fixed, as a function of the remaining parameters."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
-        """Store a problem and ``fixed`` parameters by name, including ``initial_positions`` (n, d) [m]."""
+        """Store a problem and ``fixed`` parameters by name. They must include ``initial_positions`` (n, d) [m]."""
         self.problem, self._fixed, of = problem, fixed, problem.simulation
         self.simulation = SimpleNamespace(
             batch=None, scene=of.scene, positions=fixed["initial_positions"], precision=of.precision, known=of.known
         )
-        """The attributes of a simulation that ensembles use, with fixed first positions."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FixedParameters, (self.problem, self._fixed)

@@ -1,4 +1,4 @@
-"""Particles on a device: their states, their neighbours, and sums over pairs with derivatives."""
+"""Particles on a device: states, neighbours, and sums over pairs of particles with derivatives."""
 
 from typing import TYPE_CHECKING
 

@@ -1,15 +1,15 @@
-"""Derivatives of sums over the fluid, made by Warp from the term of one pair (`cortado.particles.pair_sums`).
+"""Derivatives of sums over neighbours that Warp makes by automatic differentiation (`cortado.particles.pair_sums`).
 
-For the sums S_i = sum_j T(x_ij, c_i, c_j, v_ij, theta) with adjoints S_i^, particle i gathers
+The sum over neighbours j of particle i is S_i = sum_j T_ij. The term T_ij depends on the separation x_ij, on values c_i
+and c_j of both particles, and on parameters. Let S_i^ be the adjoint of S_i, and <a, b> the scalar product. The
+adjoints of the position and of the value of particle i are
 
     x_i^ = sum_j d<T_ij, S_i^> / dx_ij - d<T_ji, S_j^> / dx_ji
     c_i^ = sum_j d<T_ij, S_i^> / dc_i + d<T_ji, S_j^> / dc_i
 
-and likewise for other arrays, with the scalar product <a, b>. The adjoint theta^ of a particle is sum_j d<T_ij, S_i^> /
-dtheta. The tangent comes from the gradients of the components of T. Made derivatives are exact, but slower than
-handwritten ones.
+These derivatives are exact, but slower than handwritten derivatives.
 
-Call a made derivative only from a kernel: called from a `wp.func`, its C++ does not compile.
+Call a made derivative only from a kernel. If a `wp.func` calls it, its C++ code does not compile.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -37,9 +37,9 @@ TermMaker = Callable[[Discretisation], Callable[..., Any]]
 
 
 def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """Make the Warp function ``f(i, *arrays, *bars, *others, s)`` of the adjoint of a term's sums, whose adjoints are
-    ``bars``. The function returns the adjoints of particle i's entry of each array, and of each of the others.
-    ``module`` is the function's Warp module, by default that of the term's file."""
+    """Make the Warp function ``f(i, *arrays, *bars, *others, s)`` of the adjoint of a sum over neighbours. ``bars`` are
+    the adjoints of the sums. The function returns the adjoints of particle i's entry of each array, and of ``others``.
+    """
     term = _differentiable(make, d)
     arrays = {**term.arrays, **bars_of(term)}
     loop = over_fluid(d, arrays, _adjoint(term), ahead=True, numbered="j" in term.parameters)
@@ -47,7 +47,7 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
 
 
 def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """Make the Warp function of the tangents of a term's sums; its arguments are each followed by the tangent."""
+    """Make the Warp function of the tangent of a sum over neighbours. Each argument is followed by its tangent."""
     term = _differentiable(make, d)
     arrays, others = _with_tangents(term.arrays), _with_tangents(term.others)
     if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
@@ -73,7 +73,7 @@ def _made(
 
 
 def work_of(term: Term, precision: Precision, module: Any) -> Any:
-    """Make the Warp function of the scalar product of a term T with ``bar``, an adjoint of each result of T."""
+    """Make the Warp function of the scalar product of the results of a term and their adjoints."""
     types, bars = {**term.parameters, **bars_of(term)}, bars_of(term)
     products = (
         f"_term_{n} * {bar}" if kind is precision.real else f"_wp.{dot_of(kind)}(_term_{n}, {bar})"

@@ -1,15 +1,14 @@
-"""Mirrors: flat walls that act on fluid by mirror images of the particles instead of by wall particles.
+"""Flat walls that act on fluid by mirror images of the particles instead of by wall particles.
 
-An image of particle j is the reflection x -> R x + o by a flat wall, or by two or three sides of the container that
-meet. The number of a reflection at the container has a bit for each side: 1, 2, 4 at the lower ends of the axes, 8, 16,
-32 at the upper ends. Numbers from `FACES` on are flat faces of moving solids. Every image within reach of particle i is
-an image of a neighbour of i or of i. The image of j has the number ``reflections j + reflection`` in lists of
-neighbours. A wall mirrors only particles in front of it, and a face none beyond its ends.
+The mirror image of a particle at x is at R x + o. The matrix R and the vector o define a reflection at a flat wall, or
+at two or three adjacent sides of the container. Bits in the number of a reflection mark sides of the container: 1, 2, 4
+at the lower ends of the axes, and 8, 16, 32 at the upper ends. Numbers from `FACES` on are flat faces of moving solids.
 
-In a step a solid with middle c, c_0 before the step, takes the points x of a face from x - D(x) = c_0 + Q (x - c), with
-Q = R_0 R^T. If a particle moves by u, its image moves by R u + (D(R x + o) - R D(x)) / dt; dt times the second part is
-called ``swept``. If the pose of the solid changes by c', w' and g' (`MovingWalls`), with t(x) = c' + w' x (x - c) + g'
-(x - c), images change by t(R x + o) - R t(x), and mirrored vectors by w' x R u - R (w' x u).
+In lists of neighbours the image of particle j has the number ``reflections j + reflection``. A wall mirrors only
+particles in front of it.
+
+If a solid moves, the velocity of an image also depends on the displacement of the mirror in the time step, which is
+called ``swept``. Tangents and adjoints of images include the pose of the solid (`MovingWalls`).
 """
 
 from typing import Any
@@ -20,11 +19,11 @@ from cortado.device.modules import by_name
 from cortado.device.precision import Precision
 
 FACES, MOST_FACES = 64, 64
-"""Number of the first face's reflection, above all reflections at the container; and the greatest number of faces."""
+"""Number of the first face of a moving solid, and greatest number of faces."""
 NUMBERS = 2**31
 CONTAINER = -1
 NOTHING = ALL_WALLS = -NUMBERS
-"""In place of a solid's number: no solid, or the walls of all solids and the container."""
+"""Values in place of the number of a solid: for no solid, and for all walls."""
 
 
 def reflections(moving: bool) -> int:
@@ -51,19 +50,10 @@ OF_IMAGES = {
     "swept_dot": "_swept_dot(_one, x[_j], x_dot[_j], _member, s)",
 }
 OWNED = "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))"
-"""1 if an image is by the walls of ``solid``, or if ``solid`` means all walls, otherwise 0."""
 
 
 def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> dict[str, Any]:
-    """Make the Warp functions of mirrors by name, for scenes with or without moving solids.
-
-    ``sides`` returns the bits of the container's sides that a position is in front of and within reach of. ``sees``
-    tests whether a position is in front of, and within reach of, the walls of a reflection; ``shows`` tests only
-    whether it is in front of them. ``last_reflection`` is the last reflection that a position may see, or 0.
-    ``reflection`` returns R and o, and ``turned`` R a. ``mirror_of`` returns a number of the walls that mirror about a
-    position, ``mirrors_in`` tests whether a wall particle belongs to these walls, and ``mirrors_by`` whether a
-    reflection is by a solid. ``swept``, ``image_dot``, ``turned_dot`` and ``swept_dot`` exist only if solids move.
-    """
+    """Make the Warp functions of mirrors by name, for scenes with or without moving solids."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     turning = matrix if moving else vector
 
@@ -89,7 +79,6 @@ def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> 
 
     @wp.func
     def reflects(bits: int, near: int) -> bool:
-        """Test that ``bits`` are a reflection by near walls; opposite walls do not mirror each other's images."""
         return (bits & near) == bits and (bits & (bits >> 3)) == 0
 
     @wp.func
@@ -108,7 +97,6 @@ def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> 
 
     @wp.func
     def place_at(x: vector, f: int, member: int, s: neighbourhood) -> vector:
-        """Return a position's distance in front of a face, and its coordinates along the face from the middle."""
         k = s.face_solids[f]
         own = wp.transpose(s.turns[member, k]) * (x - s.after[member, k])
         return s.face_frames[f] * (own - s.scales[member, k] * s.face_places[f])
@@ -171,8 +159,6 @@ def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> 
 
     @wp.func
     def mirror_of(x: vector, member: int, s: neighbourhood) -> int:
-        """Return, where solids move, 1 near the container's mirrors, plus twice the number, from 1 on, of the nearest
-        face in reach."""
         if wp.static(not moving):
             return wp.where(near_mirrors(x, s) > 0, CONTAINER, NOTHING)
         found, face, nearest = wp.where(near_mirrors(x, s) > 0, 1, 0), int(0), real(s.reach)

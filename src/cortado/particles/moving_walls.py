@@ -1,12 +1,12 @@
-"""Wall particles as arguments of a search for neighbours, and the wall particles of moving solids.
+"""Arrays of wall particles, and the wall particles of moving solids.
 
-Wall particles of moving solids have the positions at the end of a step, and the velocity of the surface point above
-each.
+Wall particles of moving solids have the positions at the end of a time step, and the velocity of the nearest point on
+the surface.
 
-A solid may be stretched about its middle by a scale sigma, while its wall particles keep their depth. In the solid's
-frame let r be the place of a wall particle, q the nearest point of the surface, f = q - r, and w the weight. In space
-the wall particle is at c + R (sigma q - f), with the vector R f to the surface and the weight sigma^(d - 1) w, because
-its area grows.
+A solid may be stretched about its middle by a scale sigma. In the solid's frame a wall particle has the position r and
+the weight w, and q is the nearest point on the surface. The vector to the surface is f = q - r. With the middle c and
+the rotation R of the solid, the wall particle is at c + R (sigma q - f) in space. The weight is sigma^(d - 1) w in d
+dimensions, because the area grows.
 """
 
 from collections.abc import Mapping
@@ -29,25 +29,23 @@ from cortado.particles.state import Layout, zeros
 @dataclass(frozen=True)
 class WallArrays(Rows):
     positions: np.ndarray
-    """(b, 3) [m]; for moving solids in the frame of the solid"""
+    """Positions (b, 3) [m]. Positions on moving solids are in the frame of the solid."""
     weights: np.ndarray
-    """(b,) weight in the density [-]; that of a fluid particle is 1"""
+    """Weights in the density (b,) [-], where a fluid particle has the weight 1."""
     grips: np.ndarray
-    """(b,) weight [-] of wall particles without slip; 0 where fluid slips freely"""
+    """Weights of walls without slip (b,) [-], 0 for walls with free slip."""
     feet: np.ndarray
-    """(b, 3) vector to the nearest point of the surface [m]"""
+    """Vectors to the nearest point on the surface (b, 3) [m]."""
     slides: np.ndarray
-    """(b, 3) velocity with which the surface slides along the solid [m/s]"""
+    """Velocities with which the surface slides along the solid (b, 3) [m/s]."""
     solid: np.ndarray
-    """(b,) number of the solid: from 0 on if it moves, from -2 downwards if it rests; -1 for the container"""
+    """Number of the solid (b,): 0, 1, ... if it moves, -2, -3, ... if it rests, and -1 for the container."""
     faces: np.ndarray
-    """(b,) number of the mirroring flat face in front of the wall particle, or -1"""
+    """Number of the mirroring flat face in front of the wall particle (b,), or -1."""
 
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
-    """Make arrays (members, solids) of the poses of solids before and after a step, by argument names: middles [m],
-    rotations from the frame of the solid to space, scales, and tangents. The tangent of a rotation is the rotation
-    vector by which the solid turns further, per unit of the change."""
+    """Make arrays (members, solids) for the poses of solids before and after a time step, by kernel argument name."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
     kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
@@ -66,7 +64,8 @@ def resting_pose(layout: Layout) -> dict[str, wp.array]:
 
 @cache
 def turn_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions: from the adjoint of a rotation's entries to that of a further turn, and back."""
+    """Make two Warp functions: one converts the adjoint of a rotation matrix to the adjoint of a rotation vector, and
+    the other converts in the opposite direction."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
@@ -106,7 +105,6 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
     @wp.func
     def place_of(b: int, scale: real, of: own_of) -> vector:
-        """Return a wall particle's place in the frame of its scaled solid; scale 1 retains the bits."""
         return of.own[b] + (scale - real(1.0)) * (of.own[b] + of.own_feet[b])
 
     @wp.func
@@ -175,10 +173,11 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
 
 class MovingWalls:
-    """The moving wall particles of a search for neighbours; in its arrays they follow the wall particles at rest."""
+    """The wall particles of moving solids."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
-        """Take the ``walls`` of ``solids`` moving solids, numbered from ``first`` on in the search's arrays."""
+        """Take the ``walls`` of ``solids`` moving solids. In the arrays of the neighbour search they are numbered from
+        ``first`` on."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
         self.sizes = sizes_type(precision)()
@@ -186,7 +185,7 @@ class MovingWalls:
         self.sizes.power = precision.real(dimension - 1)
         self.each = [{name: array[:, k] for name, array in self.named.items()} for k in range(solids)]
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
-        """(solids,) velocities with which surfaces slide along the solids, in the solids' frames [m/s]."""
+        """Velocities with which the surfaces slide along the solids (solids,) [m/s], in the frames of the solids."""
         slides = np.zeros((solids, 3))
         slides[walls.solid] = walls.slides
         self.slides.assign(slides)
@@ -205,13 +204,13 @@ class MovingWalls:
         }
         self._sort = CellSort(grid, count, precision, device, layout.members)
         self.grid = cell_grid_type(precision)()
-        """The grid as a kernel argument; its cells start at indices into the search's arrays."""
         for name in ("origin", "frequency", "shape"):
             setattr(self.grid, name, getattr(self._sort.grid, name))
         self.grid.starts = wp.zeros_like(self._sort.grid.starts)
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write the wall particles to the arrays of a search, given the length (members,) of the step [s]."""
+        """Write the wall particles to the arrays of a neighbour search. ``time_step`` (members,) is the length of the
+        time step [s]."""
         place, write, shift, _ = self._kernels
         launch(place, self._all, self._device, self._own, self.named)
         self._sort(self._own["x"])

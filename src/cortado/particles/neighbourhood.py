@@ -1,8 +1,4 @@
-"""The neighbourhood of a particle, as one argument of kernels that sum over neighbours, wall particles and images.
-
-Warp functions here load array entries without Warp's support of negative indices, which costs a comparison and an
-addition per load.
-"""
+"""The neighbourhood of a particle, as one argument of kernels that sum over neighbours, wall particles and images."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,8 +16,8 @@ from cortado.particles.mirrors import mirror_functions
 
 @cache
 def loads(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the Warp functions that load one element, at indices that are not negative, of a list [neighbour, particle]
-    or of a contiguous array. A tape can differentiate ``taped`` functions."""
+    """Make the Warp functions that load one element of a list [neighbour, particle] or of a contiguous array. Indices
+    must not be negative. ``taped`` functions can be recorded by a Warp tape."""
     return _of_warp(precision) if taped else _direct(precision)
 
 
@@ -70,8 +66,7 @@ def _direct(precision: Precision) -> SimpleNamespace:
 
 
 UNROLL = 4
-"""Number of fluid neighbours that a loop processes together, so that their loads overlap. Lists are padded to a
-multiple of `UNROLL` with the particle itself, which only adds W(0) to the density."""
+"""Number of fluid neighbours that a loop processes together."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +74,11 @@ class Discretisation:
     smoothing: SmoothingKernel
     precision: Precision
     lanes: int = 1
-    """Number of GPU threads for each particle, see `cortado.device.precision`."""
+    """Number of GPU threads for each particle. See `cortado.device.precision`."""
     periodic: bool = False
     moving: bool = False
     taped: bool = False
-    """True for forward kernels with Warp's adjoint, for a tape; they need a single lane."""
+    """True if a Warp tape differentiates the forward kernels. They then need a single thread per particle."""
 
     @property
     def types(self) -> tuple[Any, Any, Any]:
@@ -95,11 +90,11 @@ class Discretisation:
 
     @property
     def still(self) -> "Discretisation":
-        """A copy with walls at rest, for terms that are linear in the fluid's velocities alone."""
+        """Return a copy with walls at rest."""
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
-        """Return the Warp module of forward or adjoint kernels; ``topic`` is that of a file or solver."""
+        """Return the Warp module of forward or adjoint kernels for a ``topic``, such as a solver."""
         return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
 
     def tangent_module(self, topic: str) -> Any:
@@ -119,76 +114,79 @@ class Discretisation:
 
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
-    """Make the Warp struct of a neighbourhood; arrays are sorted by cell, lists are [neighbour, particle]."""
+    """Make the Warp struct of a neighbourhood. Its arrays are sorted by cell."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Neighbourhood:
         first: wp.int32
         part: wp.int32
         particles: wp.int32
-        """Number of particles of one scene; particle i belongs to scene i // particles of a batch."""
+        """Number of particles of one scene in a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
-        """Fluid neighbours, padded with the particle itself, then wall neighbours, then images within reach."""
+        """Lists [neighbour, particle] of fluid neighbours, then wall neighbours, then images. Lists of fluid neighbours
+        are padded with the particle itself."""
         fluid_count: wp.array(dtype=wp.int32)
-        """Length of the padded list of fluid neighbours, a multiple of `UNROLL`."""
+        """Length of the padded list of fluid neighbours."""
         filling: wp.array(dtype=wp.int32)
         count: wp.array(dtype=wp.int32)
         all_count: wp.array(dtype=wp.int32)
         wall_positions: wp.array(dtype=vector)
-        """[m]"""
+        """Positions of wall particles [m]."""
         wall_weights: wp.array(dtype=real)
-        """w_b [-]: weight of a wall particle in the density; that of a fluid particle is 1."""
+        """Weight of a wall particle in the density [-]. The weight of a fluid particle is 1."""
         wall_grips: wp.array(dtype=real)
-        """w_b of walls without slip, 0 of others [-]."""
+        """Weight of a wall particle without slip [-], 0 with free slip."""
         wall_velocities: wp.array(dtype=vector)
-        """Velocity of the surface point above a wall particle [m/s]; used if the `Discretisation` is moving."""
+        """Velocity of the surface at a wall particle [m/s]."""
         wall_feet: wp.array(dtype=vector)
-        """Vector from a wall particle to the nearest point of the surface [m]."""
+        """Vector from a wall particle to the nearest point on the surface [m]."""
         wall_solids: wp.array(dtype=wp.int32)
-        """Number of the solid: from 0 on if it moves, from -2 downwards if it rests; -1 for the container."""
+        """Number of the solid: 0, 1, ... if it moves, -2, -3, ... if it rests, and -1 for the container."""
         wall_positions_dot: wp.array(dtype=vector)
-        """Tangents of wall particles, only if walls move."""
+        """Tangents of the positions of wall particles."""
         wall_velocities_dot: wp.array(dtype=vector)
         wall_turns_dot: wp.array(dtype=vector)
-        """Tangents of the rotation of a wall particle's solid, rotation vectors."""
+        """Tangents of the rotations of solids at wall particles, as rotation vectors."""
         wall_growths_dot: wp.array(dtype=real)
-        """Relative tangents of weights and grips [-]."""
+        """Relative tangents of the weights of wall particles [-]."""
         support: real
         """Support radius h [m]."""
         per_support: real
-        """1 / h [1 / m]."""
+        """Inverse support radius [1 / m]."""
         reach: real
-        """Search radius [m], a little above the support radius."""
+        """Search radius [m], slightly larger than the support radius."""
         normalisation: real
-        """sigma of the kernel [1 / m^d]."""
+        """Normalisation factor of the smoothing kernel [1 / m^d]."""
         self_weight: real
-        """W(0) [1 / m^d]."""
+        """Smoothing kernel at distance 0 [1 / m^d]."""
         response_scale: real
-        """(sum_j |G_j|^2)^(-1/2) of a filled neighbourhood [m^(d + 1)], for the relaxation beside walls."""
+        """Inverse root of the sum of squared kernel gradients in a filled neighbourhood [m^(d + 1)]."""
         laplacian_correction: real
-        """Correction factor of second derivatives [-], see `cortado.discretise.smoothing`."""
+        """Correction factor of second derivatives [-]. See `cortado.discretise.smoothing`."""
         volume: real
-        """Volume V of a particle [m^d] with which the rest lattice has the rest density."""
+        """Particle volume on the rest lattice [m^d]."""
         period: vector
-        """[m], 0 along an axis that is not periodic."""
+        """Lengths of the periodic box [m], 0 along axes that are not periodic."""
         frequency: vector
-        """1 / period [1 / m], or 0."""
+        """Inverse lengths of the periodic box [1 / m], 0 along axes that are not periodic."""
         mirror_lower: vector
-        """Coordinates of mirroring walls at the lower ends of the axes [m], -inf without one."""
+        """Coordinates of mirroring walls at the lower ends of the axes [m], or -inf."""
         mirror_upper: vector
         faces: wp.int32
-        """Number of mirroring flat faces of moving solids; the following fields are used only if walls move."""
+        """Number of mirroring flat faces of moving solids."""
         face_solids: wp.array(dtype=wp.int32)
         face_places: wp.array(dtype=vector)
         """Middles of the faces in the frames of their solids [m]."""
         face_frames: wp.array(dtype=matrix)
-        """Rows: the normal towards the fluid and two unit vectors along a face, in the solid's frame."""
+        """Matrix for each face, in the frame of its solid. The rows are the normal towards the fluid and two unit
+        vectors along the face."""
         face_sizes: wp.array(dtype=vector)
-        """0, and half the lengths of a face along its unit vectors [m]."""
+        """Vector (0, a, b) for each face, where a and b are half the lengths of the face along its two unit vectors
+        [m]."""
         wall_faces: wp.array(dtype=wp.int32)
-        """Number of the face in front of a wall particle, or -1."""
+        """Number of the mirroring face in front of a wall particle, or -1."""
         after: wp.array2d(dtype=vector)
-        """(members, solids), like the following fields: poses of solids, see `pose_arrays`."""
+        """Middles of solids after the time step (members, solids) [m]."""
         turns: wp.array2d(dtype=matrix)
         before: wp.array2d(dtype=vector)
         turns_before: wp.array2d(dtype=matrix)
@@ -206,13 +204,17 @@ def neighbourhood_type(precision: Precision) -> Any:
 
 @cache
 def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of a separation x in a neighbourhood.
+    """Make the Warp functions of the separation of two particles, such as the gradient of the smoothing kernel W. For
+    the separation x the gradient is a x, where a is the derivative of W divided by the distance.
 
-    ``separation`` is x_i - x_j of the nearest image. With the kernel's gradient G = a x, ``slope`` is a,
-    ``slope_change`` u^T grad a, ``slope_gradient`` grad a, and ``hessian_product`` H u = a u + (u^T grad a) x.
-    ``per_size`` is 1 / (|x|^2 + 0.01 h^2). ``factor`` is F = laplacian_correction per_size x^T G, for second
-    derivatives after Brookshaw (1985). ``neighbour`` is the k-th in the list of i, ``several`` the numbers of `UNROLL`
-    neighbours from the k-th on. ``vectors``, ``numbers`` and ``sixes`` load the entries of several neighbours together.
+    - ``separation`` is x_i - x_j, to the nearest periodic image.
+    - ``slope`` is a, ``slope_gradient`` is grad a, and ``slope_change`` is u^T grad a for a vector u.
+    - ``hessian_product`` is the Hessian of W times u, which is a u + (u^T grad a) x.
+    - ``per_size`` is 1 / (|x|^2 + 0.01 h^2), with the support radius h.
+    - ``factor`` is the factor of second derivatives after Brookshaw (1985).
+    - ``neighbour`` loads one neighbour of particle i, and ``several`` loads `UNROLL` neighbours.
+    - ``vectors``, ``numbers`` and ``sixes`` load the values of several neighbours together.
+
     The functions of `loads` and `mirror_functions` are included.
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector

@@ -1,14 +1,12 @@
-"""Neighbours: particles sorted by cell, and a symmetric list of neighbours for a step.
+"""Neighbours: particles sorted by cell, and a symmetric list of neighbours for a time step.
 
-The list reaches a little beyond the support radius (`SKIN`), because the density is also computed at predicted
-positions. Without the skin the next state would be discontinuous where a pair enters the support during the step, as on
-lattices.
+The list reaches slightly beyond the support radius (`SKIN`), because the density is also computed at predicted
+positions. Without this margin the next state would be discontinuous when a pair enters the support during the step.
 
-The list contains j for i exactly if it contains i for j, because |x_i - x_j| has the same bits from both sides.
+The list of particle i contains j exactly if the list of j contains i.
 
-Candidates come from the cells around a particle: rows of cells along x, and within a cell in the order of the
-particles. A single thread compares 32 candidates before it appends those within reach, because appending threads of a
-GPU wait for one another. Many lanes treat the candidates of all rows as one range.
+The candidates are the particles in the cells around a particle. A single thread compares 32 candidates before it
+appends neighbours, because threads of a GPU wait for one another when they append.
 """
 
 from functools import cache
@@ -58,7 +56,8 @@ def scan_types(discretisation: Discretisation) -> TypesByName:
 
 @cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
-    """Make the Warp function, for one lane, that appends near particles ``first`` to ``last`` - 1 except ``own``."""
+    """Make the Warp function that appends the neighbours among the particles from ``first`` to ``last`` - 1, except
+    ``own``. It uses one thread per particle."""
     pair = pair_functions(discretisation)
     separation, load = pair.separation, pair.load_vector
 
@@ -123,8 +122,7 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
 
 
 def scan_around(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends the particles within reach of cell c's surroundings, except particle ``own``.
-    The scene's cells begin at layer ``bottom``."""
+    """Make the Warp function that appends neighbours in the cells around cell c."""
     return (scan_at_once if discretisation.lanes >= LEAST_AT_ONCE else scan_by_rows)(discretisation)
 
 
@@ -160,7 +158,6 @@ def scan_by_rows(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_at_once(discretisation: Discretisation) -> Any:
-    """Make the Warp function of `scan_around` that visits all rows as one range, except at the grid's ends."""
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     pair = pair_functions(discretisation)
@@ -228,8 +225,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
 
     @typed.kernel(discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
-        """List neighbours, and write to ``needed`` the greatest length in each range, even without room for it. Scenes
-        with a lost particle (``bad_step`` >= 0) get empty lists."""
+        """List neighbours, and write the greatest lengths to ``needed``, even if they exceed the capacity."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:
@@ -306,7 +302,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
 
 
 def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
-    """Return (cells,) True for cells with walls in or around them; ``starts`` has the first wall particle of each."""
+    """Return a mask (cells,) of cells with walls inside or around them."""
     near = np.diff(starts).reshape(grid.shape[::-1]) > 0
     for axis in range(3):
         near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
@@ -314,10 +310,10 @@ def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
 
 
 class NeighbourSearch:
-    """A search that sorts particles by cell and lists their neighbours, on one device, without reads by the host.
+    """A search that sorts particles by cell and lists their neighbours on one device.
 
-    Lists are stored [particle][neighbour] on a CPU and [neighbour][particle] on a GPU; kernels index [neighbour,
-    particle].
+    Lists are stored as [particle][neighbour] on a CPU and as [neighbour][particle] on a GPU. Kernels always index
+    [neighbour, particle].
     """
 
     def __init__(
@@ -331,8 +327,8 @@ class NeighbourSearch:
         dimension: int = 3,
         mirrored: bool = False,
     ):
-        """Allocate the search. All scenes of a batch share the ``walls`` at rest; the walls of ``solids`` moving solids
-        follow, scene by scene. Lists contain images if fluid is ``mirrored``."""
+        """Allocate the arrays of the search for ``walls`` at rest and for ``solids`` moving solids. Lists contain
+        mirror images if fluid is ``mirrored``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         if mirrored and particles > (most := most_imaged(discretisation.moving)):
             raise InputError(
@@ -346,7 +342,7 @@ class NeighbourSearch:
         self.order = self._sort.order
         names = "fluid_count", "filling", "count", "all_count"
         self.lists = {name: wp.zeros(particles, dtype=wp.int32, device=device) for name in names}
-        """Lengths (n,) of the lists by kernel argument names."""
+        """Lengths of the lists (n,), by kernel argument name."""
         self.fluid_count, self.filling, self.count, self.all_count = self.lists.values()
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
@@ -361,13 +357,13 @@ class NeighbourSearch:
         self.walls = {
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
         }
-        """Arrays of wall particles by kernel argument name, those at rest first; tangents only if solids move."""
+        """Arrays of wall particles by kernel argument name. Wall particles at rest come first."""
         self.walls["wall_faces"].fill_(-1)
         self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
         self.moving = MovingWalls(moving, len(still), solids, dimension, grid, layout) if solids else None
-        """The walls of solids that move."""
+        """Walls of moving solids."""
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 
@@ -381,7 +377,7 @@ class NeighbourSearch:
             self.neighbours = wp.empty(shape[::-1], dtype=wp.int32, device=self.device)
 
     def sort(self, positions: wp.array) -> None:
-        """Write the order of the cells to ``order``, for positions (members n,) [m]; ties retain the given order."""
+        """Sort positions (members * n,) [m] by cell, and write the order to ``order``. The sort is stable."""
         if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
             self._sort_walls(self._unsorted_walls)
             self._unsorted_walls = None
@@ -401,8 +397,8 @@ class NeighbourSearch:
         self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
-        """List the neighbours of sorted positions (members n,) [m]; scenes whose ``bad_step`` (members,) is not -1 get
-        empty lists. Lists are too short if `needed` exceeds the capacity."""
+        """List the neighbours of sorted positions (members * n,) [m]. Scenes whose ``bad_step`` (members,) is not -1
+        get empty lists. Lists are incomplete if `needed` exceeds the capacity."""
         given = {"s": neighbourhood, "bad_step": bad_step, "x": positions, "needed": self._needed}
         grids = {"grid": self._sort.grid, "wall_grid": self._wall_sort.grid, "near_walls": self._near_walls}
         moving = self._wall_sort.grid if self.moving is None else self.moving.grid
@@ -412,7 +408,7 @@ class NeighbourSearch:
 
     @property
     def needed(self) -> int:
-        """Return the length of the longest list since `forget_needed`, even if it exceeded the capacity."""
+        """Return the length of the longest list since the last `forget_needed`, even if it exceeded the capacity."""
         return int(self._seen.read().max())
 
     def forget_needed(self) -> None:

@@ -9,7 +9,7 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
 
     x_ij               the separation x_i - x_j of the nearest image
     c_i, c_j, v_ij     an array's entry of the particle, of its neighbour, and v_i - v_j
-    i, j               their numbers; j is -1 for a wall particle
+    i, j               the numbers of the particles; j is -1 for a wall particle
     foot               for walls: the vector from a wall particle to the nearest point of the surface
     mirrored           for works of walls: 1 if the wall mirrors about particle i, otherwise 0
     turn_dot           for tangents of terms of walls: the tangent of the rotation of the wall's solid
@@ -19,14 +19,14 @@ is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, an
     any other          a value for all neighbours of a particle, which stands between the arrays and s
 
 A term with several values makes several sums in one loop. For a wall particle every value with index j is 0, unless
-walls have a separate term, and the term is multiplied by the weight w_b. Sums are source texts of loops that Warp
-compiles. In these texts all names except parameters begin with an underscore; names of parameters must not.
+walls have a separate term, and the term is multiplied by the weight of the wall particle. Names of parameters must not
+begin with an underscore.
 
-With ``ahead=False`` a neighbour's entries are loaded just before its term is computed. Loading them earlier is quicker
-if terms are cheap.
+With ``ahead=False`` the values of a neighbour are loaded just before its term is computed. Loading them earlier is
+quicker if terms are cheap.
 
-Derivatives of sums are handwritten (`tangent_of`, `adjoint_of`) where Warp's (`cortado.particles.made_derivatives`)
-would slow down a step; tests compare all derivatives in `BY_HAND` with Warp's.
+Derivatives of sums are handwritten (`tangent_of`, `adjoint_of`) where derivatives by Warp
+(`cortado.particles.made_derivatives`) would slow down a step. Tests compare all derivatives in `BY_HAND` with Warp's.
 """
 
 import inspect
@@ -54,8 +54,8 @@ class Term:
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """Read the term of a function with an annotation at each parameter, and ``tuple[...]`` for several results.
-        Raise `TypeError` for missing annotations, or names that begin with an underscore."""
+        """Read the term of a function, whose parameters need annotations. Raises `TypeError` for missing annotations
+        and for names that begin with an underscore."""
         types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
         for name in names:
             if name not in types or isinstance(types[name], str):
@@ -107,7 +107,8 @@ class Term:
 
 
 def array_of(parameter: str) -> str:
-    """Return the array of which a parameter is an entry; an empty text for other parameters."""
+    """Return the name of the array for a parameter such as ``c_i``, or an empty text for a parameter without
+    an array."""
     array, _, index = parameter.rpartition("_")
     return array if index in INDICES else ""
 
@@ -151,16 +152,14 @@ Function = Callable[..., Any]
 Decorator = Callable[[Function], Any]
 Types = Mapping[str, Any]
 Body = Callable[[Mapping[str, str]], Iterable[str]]
-"""A function of the source of a neighbour's entries, which returns the lines of a loop that add to _total_0, ..."""
 
 
 def over_fluid(
     d: Discretisation, arrays: Types, body: Body, ahead: bool, numbered: bool, separated: bool = True
 ) -> str:
-    """Return the source of a loop over the fluid that reads neighbours' entries of these arrays.
+    """Return the source text of a loop over fluid neighbours that reads the entries of ``arrays``.
 
-    ``ahead`` loads the entries of `UNROLL` neighbours before using any. ``numbered`` loops define the neighbour's
-    number _j, ``separated`` loops _x_ij.
+    ``ahead`` loads the entries of `UNROLL` neighbours before using any of them.
     """
     kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
     loads = kinds if ahead else {}
@@ -175,8 +174,7 @@ def over_fluid(
 
 
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
-    """Return the source of a loop over images of the fluid and of the particle itself. Images have the particles'
-    numbers, mirrored vectors, and matrices mirrored from the left."""
+    """Return the source text of a loop over mirror images."""
 
     def of_j(array: str, kind: Any) -> str:
         of = array.removesuffix("_dot")
@@ -191,8 +189,7 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 
 def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], weight: str) -> str:
-    """Return the source of a loop over the walls, with a ``weight`` and with the entries ``known`` of `OF_WALLS`.
-    Moving walls also have a velocity v, and tangents."""
+    """Return the source text of a loop over wall particles."""
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
     turned = TURN if d.moving else zero(d.precision.vector, d)
@@ -277,8 +274,6 @@ def _summing(
     module: Any = None,
     grows: Any = None,
 ) -> Decorator:
-    """Return the decorator of a sum; ``typed`` gives types to the parameters without any."""
-
     def make(function: Function) -> Any:
         function = typed(function) if typed else function
         term, wall = Term.of(function), Term.of(walls or function)
@@ -301,8 +296,10 @@ def pair_sum(
     grows: Any = None,
 ) -> Decorator:
     """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
-    ``walls`` is a separate term of walls, whose parameters the fluid's term must have. A sum that ``rubs`` excludes
-    walls that slip freely. For a tangent, ``grows`` is the sum whose terms multiply the tangents of weights."""
+
+    ``walls`` is a separate term for walls. Its parameters must also be parameters of the fluid's term. With ``rubs``,
+    walls with free slip are excluded. ``grows`` is used only for tangents with moving walls.
+    """
 
     def loops(term: Term, wall: Term) -> str:
         _check_walls(wall, term)
@@ -312,17 +309,17 @@ def pair_sum(
 
 
 def fluid_sum(d: Discretisation, typed: TypesByName | None = None, ahead: bool = True, module: Any = None) -> Decorator:
-    """Return a decorator that turns the term of a pair into its sum over the fluid alone."""
+    """Return a decorator that turns the term of a pair into its sum over fluid neighbours."""
     return _summing(d, typed, lambda term, _: _over_fluid(term, d, ahead), module=module)
 
 
 def image_sum(d: Discretisation, typed: TypesByName | None = None) -> Decorator:
-    """Return a decorator that turns the term of a pair into its sum over the images of the fluid in mirroring walls."""
+    """Return a decorator that turns the term of a pair into its sum over the mirror images of the fluid."""
     return _summing(d, typed, lambda term, _: over_images(d, term.of_neighbours, _adding_up(term)))
 
 
 def image_sum_of_solid(total: Any) -> Any:
-    """Return a sum over images restricted to the images by the walls of ``solid``, an argument before s."""
+    """Return the part of a sum over images that comes from the walls of ``solid``, an argument before s."""
     d, body = total.discretisation, _adding_up(total.term, f"{OWNED} * ")
     others, loop = {**total.others, "solid": int}, over_images(d, total.arrays, body)
     scope = {"_term": wp.func(total.term.function, module=total.module)}
@@ -330,8 +327,8 @@ def image_sum_of_solid(total: Any) -> Any:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """Return a function that takes the term of walls and returns the decorator of a sum with friction: `pair_sum` over
-    fluid and walls without slip if fluid ``sticks`` to some walls, otherwise `fluid_sum`."""
+    """Return a decorator factory for sums with friction. If fluid ``sticks`` to walls, the sum includes walls without
+    slip."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, None, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, None, ahead)
@@ -340,7 +337,8 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 
 def wall_sum(d: Discretisation, typed: TypesByName | None = None, grows: Any = None, weight: str = ALL) -> Decorator:
-    """Return a decorator that turns a term into its sum over the walls alone, with the source text of a ``weight``."""
+    """Return a decorator that turns a term into its sum over wall particles. ``weight`` is the source text of the
+    weight."""
     return _summing(d, typed, lambda _, wall: _over_walls(wall, d, grows, weight), grows=grows)
 
 
@@ -392,8 +390,7 @@ class ByHand:
     """A handwritten derivative of a sum, as a Warp function."""
 
     kind: str
-    """"tangent" or "adjoint". An adjoint returns the adjoints of particle i's entries in each array, in the order of
-    the arrays, and then those of other arguments or further values that a kernel needs."""
+    """"tangent" or "adjoint"."""
     of: Any
     function: Any
 

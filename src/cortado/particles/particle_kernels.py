@@ -1,14 +1,16 @@
-"""Kernels with a thread for each particle, made from functions whose parameter names define the kernel's arguments.
+"""Kernels with one thread for each particle, made from functions whose parameter names define the kernel's arguments.
 
     @particle_kernel(module, "c_new", [over(spread, "total", w="m")], numbers=["scale"])
     def flux(total: fractions, c_i: fractions, m_i: real, time_step: real, scale: real) -> fractions:
         return c_i + (time_step * scale / m_i) * total
 
 is a kernel that sums ``spread`` over the neighbours of particle i, with m as the array w, and writes the function's
-result to c_new[i]. Parameters are results of sums; entries c_i of arrays c; the particle's number ``i`` and its scene's
-number ``member``; the neighbourhood ``s``; numbers and whole arrays of a launch. All others, such as ``time_step``, are
-entries of the particle's scene. A result "+x_bar" is added to the array's entry; "acceleration:acceleration_in" writes
-the result plus the entry of acceleration_in.
+result to c_new[i].
+
+Parameters are results of sums, entries c_i of arrays c, the particle's number ``i``, its scene's number ``member``, the
+neighbourhood ``s``, and numbers and whole arrays of a launch. All others, such as ``time_step``, are entries of the
+particle's scene. A result "+x_bar" is added to the entry of the array. A result "acceleration:acceleration_in" is
+written as the sum of the result and the entry of acceleration_in.
 
 `sum_kernels` makes the kernels of a multiple of a sum. `pointwise_kernels` lets Warp differentiate a function r =
 f(x_i, ..., time_step, ...) of a particle's values:
@@ -19,8 +21,8 @@ f(x_i, ..., time_step, ...) of a particle's values:
 Particles store their terms of the adjoint of a scene's parameter, which are summed later. The tangent of a rotation R
 is the vector w with R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
 
-Two traps of Warp: after ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, whereas ``a =
-array[j]`` makes a copy; and ``wp.grad`` does not compile in a function that the kernel's function calls.
+Warp has two traps. After ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, whereas ``a =
+array[j]`` makes a copy. ``wp.grad`` does not compile in a function that the kernel's function calls.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -46,7 +48,7 @@ def {name}({parameters}):
 """
 MADE = "made_"
 MOST_ARRAYS = 8
-"""Greatest number of single array arguments; more are bundled, because each argument lengthens a launch."""
+"""Greatest number of separate array arguments. Further arrays are passed in a struct."""
 TANGENT = """\
 _total_{n} = _kind_{n}()
     _components = int({components})
@@ -55,11 +57,11 @@ _total_{n} = _kind_{n}()
         {unit}[{entry}] = _one
         {gradient}
         _total_{n} += ({change}) * {unit}"""
-"""Source text of the tangent of a vector or matrix. A variable ``_components`` keeps Warp from unrolling the loop."""
+"""Source text of the tangent of a vector or matrix."""
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
-    """Make the Warp kernel with arguments of these types from source lines, which may use the names in ``scope``."""
+    """Make a Warp kernel with arguments of given types from source lines. The lines may use the names in ``scope``."""
     text = KERNEL.format(name=name, parameters=", ".join(types), body="\n    ".join(body))
     known = {"wp": wp, **scope}
     exec(text, known)
@@ -84,7 +86,8 @@ class Over:
 
 
 def over(function: Any, names: str, /, **renamed: str) -> Over:
-    """Name the results of a sum over neighbours for a kernel, one word each, and rename its arguments."""
+    """Describe a sum over neighbours for `particle_kernel`. ``names`` are the names of its results, separated by
+    spaces, and ``renamed`` gives the kernel's names for arguments of the sum."""
     return Over(function, names.split(), renamed)
 
 
@@ -100,9 +103,8 @@ def particle_kernel(
     name: str | None = None,
     typed: TypesByName | None = None,
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that turns a function of one particle, with annotations, into a kernel in a Warp module.
-    ``results`` are the arrays that the kernel writes, one word each; ``name`` replaces the function's name, and
-    ``typed`` gives types to the parameters without any."""
+    """Return a decorator that turns a function of one particle into a kernel in a Warp module. ``results`` are the
+    names of the arrays that the kernel writes, separated by spaces."""
 
     def make(function: Callable[..., Any]) -> Any:
         function = typed(function) if typed else function
@@ -131,8 +133,8 @@ def sum_kernel(
     numbers: Collection[str] = (),
     **renamed: str,
 ) -> Any:
-    """Make the kernel of one sum, multiplied by the text ``times``, divided by the text ``per``, and written or
-    added."""
+    """Make the kernel of a sum over neighbours. The sum is multiplied by the source text ``times`` and divided by the
+    source text ``per``."""
     arguments = _Arguments([Over(total, [f"total_{n}" for n in range(len(total.results))], renamed)], numbers)
     for number in numbers:
         arguments.entry(number, total.discretisation.precision.real)
@@ -154,10 +156,12 @@ def sum_kernels(
     written: Collection[str] = (),
     **renamed: str,
 ) -> Kernels:
-    """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, the three ``sums``, in the three
-    Warp ``modules``. The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``: ``before`` is an
-    array, the others are source texts, all optional. Adjoints of inputs are added to, except those of ``written``
-    arrays."""
+    """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, in three Warp ``modules``.
+
+    The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``. ``before`` is an array, and ``times``
+    and ``per`` are source texts. Adjoints are added to the adjoints of the inputs, except for ``written`` arrays, which
+    are overwritten.
+    """
     total, tangent, adjoint = sums
     told = {**renamed, **dotted(renamed)}
     known = [*total.arrays, *(name for name in total.others if name not in numbers)][: len(adjoint.results)]
@@ -244,13 +248,10 @@ def pointwise_kernels(
     replaced: Mapping[str, str] | None = None,
     **names: Any,
 ) -> Kernels:
-    """Make forward, tangent and adjoint kernels, in the three Warp ``modules``, of the function that ``make(module)``
-    returns.
+    """Make the forward, tangent and adjoint kernels of a function of one particle, in three Warp ``modules``.
 
-    The function has an annotation at each parameter; ``results`` are the arrays that it writes. For
-    "acceleration:acceleration_in" the result plus acceleration_in is written. ``replaced`` maps a result to an input
-    whose adjoints share one array: the adjoint kernel overwrites the result's adjoint with the input's. All other
-    ``names`` are the groups of `Kinds`.
+    ``make(module)`` returns the function. ``results`` are the names of the arrays that it writes. ``replaced`` maps a
+    result to an input that shares its adjoint array. The remaining ``names`` are the fields of `Kinds`.
     """
     functions = [make(module) for module in modules]
     terms = [Term.of(function) for function in functions]
@@ -267,25 +268,24 @@ def pointwise_kernels(
 
 @dataclass(frozen=True)
 class Kinds:
-    """Roles of parameters and results in pointwise kernels; all groups are optional."""
+    """Roles of parameters and results in pointwise kernels. All fields are optional."""
 
     replaced: Mapping[str, str]
     numbers: Collection[str] = ()
-    """Parameters that are numbers of a launch, without derivatives."""
+    """Parameters that are equal for all threads and have no derivatives."""
     written: Collection[str] = ()
-    """Inputs whose adjoints are overwritten instead of added to."""
+    """Inputs with adjoints that the adjoint kernel overwrites."""
     known: Collection[str] = ()
     where: str = ""
-    """An array of numbers; where an entry is 0, tangents of results are 0."""
+    """Name of an array that selects particles. Tangents of results are 0 where its entry is 0."""
     told: Collection[str] = ()
-    """Inputs with a column for each step; ``step`` is the column, and each thread is a scene."""
+    """Inputs with a column for each time step."""
     summed: Collection[str] = ()
-    """Results whose sums over scenes have adjoints ``name_sum_bar`` (scenes,)."""
+    """Results that are summed over the particles of each scene."""
     turned: Mapping[str, str] = field(default_factory=dict)
-    """Rotations, with the names of their further turns."""
+    """Names of rotation matrices, with the names of their tangents, which are rotation vectors."""
     read: Mapping[str, str] = field(default_factory=dict)
-    """Parameters by which a function reads a table (`cortado.sph.formula`), with their source texts in a kernel. The
-    adjoint kernel then has ``rows`` threads for each scene, which loop over particles."""
+    """Parameters for values of a table (`cortado.sph.formula`), with their source texts in a kernel."""
 
 
 class _Pointwise:

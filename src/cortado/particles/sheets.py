@@ -1,16 +1,19 @@
-"""Sheets: walls of no thickness, through which particles do not see each other.
+"""Sheets, which are walls without thickness. Particles on opposite sides of a sheet do not interact.
 
-Lists of neighbours are first made without sheets. Once in each step these hidden neighbours are removed:
+Lists of neighbours are first made without sheets. Once in each time step these hidden neighbours of particle i are
+removed:
 
 - particle j, if the segment from i to j crosses a sheet;
 - the image of j, if the segment to it, or from the image of i to j, crosses a sheet;
-- a wall particle of a sheet, if the segment to it does not cross this sheet, or crosses another;
-- any other wall particle, if the segment to it crosses a sheet.
+- a wall particle of a sheet, unless the segment to it crosses this sheet and no other sheet;
+- a wall particle of a solid or the container, if the segment to it crosses a sheet.
 
-The sheet's wall particles fill the part of the support that the sheet hides, also at tips and holes. Positions, also of
-sheets, are those before the step: a particle ends a step on the side where it begins
-(`cortado.solvers.projection.sides`). Lists of fluid neighbours are symmetric:
-for both particles of a pair the segment from the one with the lower number is tested. Visibility has no derivative.
+The wall particles of a sheet fill the hidden part of the support, also at tips and holes. Positions of particles and
+sheets are the positions before the time step. A particle ends a time step on the side where it begins
+(`cortado.solvers.projection.sides`).
+
+Lists of fluid neighbours are symmetric, because the tested segment of a pair always starts at the particle with the
+lower number. Visibility has no derivative.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,21 +36,21 @@ from cortado.particles.state import Layout
 @dataclass(frozen=True)
 class PlacedSheet:
     number: int
-    """Number of the sheet's wall particles (`cortado.scene.motions.wall_numbers`): from 0 on for a moving sheet."""
+    """Number of the sheet (`cortado.scene.motions.wall_numbers`), which is negative for a sheet at rest."""
     sheet: Sheet
-    """The sheet's geometry: a moving sheet about its middle without rotation, a sheet at rest in its place."""
+    """Geometry of the sheet. The coordinates of a moving sheet are relative to its middle and without rotation."""
 
 
 @cache
 def sheets_type(precision: Precision) -> Any:
-    """Return the Warp struct of the edges or triangles of sheets: of moving sheets in the frames of their solids."""
+    """Return the Warp struct of the edges or triangles of sheets."""
     return struct_of("Sheets", precision, faces=faces_type(precision), numbers=wp.array(dtype=wp.int32))
 
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make the Warp functions ``scale_of`` sheet k; and ``seen_from``, a position in the sheet's frame, about its
-    middle and divided by its scale, for the poses ``middles`` and ``turns`` of solids."""
+    """Make two Warp functions. ``scale_of`` returns the scale of a sheet. ``seen_from`` converts a position to the
+    frame of a sheet."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
     turnings = wp.array2d(dtype=precision.matrix)
@@ -84,7 +87,8 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def crossed(p: vector, q: vector, own: int, member: int, s: neighbourhood, sheets: sheets_of) -> int:
-        """Return 1 if a segment crosses the sheet with the wall particles ``own``, 2 for another sheet, 3 for both."""
+        """Return 1 if a segment crosses the sheet with number ``own``, 2 if it crosses a different sheet, and 3 if it
+        crosses both."""
         found = int(0)
         for k in range(sheets.numbers.shape[0]):
             start = seen_from(p, s.before, s.turns_before, k, member, s, sheets)
@@ -95,7 +99,6 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def is_near(x: vector, member: int, reach: real, s: neighbourhood, sheets: sheets_of) -> bool:
-        """Test whether a sheet may be near enough for its wall particles to be within reach."""
         for k in range(sheets.numbers.shape[0]):
             y = seen_from(x, s.before, s.turns_before, k, member, s, sheets)
             face = int(0)
@@ -169,5 +172,6 @@ class Sheets:
     def hide(
         self, launch: Callable[..., None], discretisation: Discretisation, search: NeighbourSearch, **known: Any
     ) -> None:
-        """Remove hidden neighbours from a search's lists, given the neighbourhood ``s`` and sorted positions ``x``."""
+        """Remove hidden neighbours from the lists of a search. ``known`` has the neighbourhood ``s`` and sorted
+        positions ``x``."""
         launch(hiding_kernel(replace(discretisation, lanes=1)), search.lists, sheets=self.struct, **known)

@@ -1,6 +1,7 @@
-"""The inputs of a step as Warp arrays by name: the state before the step, the sorted particles, and the parameters.
+"""The inputs of a time step as Warp arrays by name: the state before the step, the sorted particles, and the
+parameters.
 
-Vectors have three components on a device; in 2-D z is 0.
+Vectors have three components on a device, and z is 0 in 2-D.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,28 +29,28 @@ class Entry(Enum):
 
 @dataclass(frozen=True)
 class StateField:
-    """An array of the state that a step reads and writes, declared by a solver or a part. Every value that a step reads
-    from the previous step must be such a field, because a run restarts from its state alone."""
+    """An array of the state, declared by a solver or a part. Every value that a step reads from the previous step must
+    be a state field, because a run restarts from its state alone."""
 
     name: str
     unit: str
-    """In SI; empty for a plain number."""
+    """SI unit, or an empty text for a plain number."""
     entry: Entry
     axis: Axis = Axis.PARTICLE
-    """PARTICLE for an entry per particle, in the scene's order; SCALAR for one entry."""
+    """PARTICLE for one entry per particle, in the order of the scene, or SCALAR for a single entry."""
     first: str | None = None
-    """Parameter that gives the first value, over time by its first row; None for a field that begins at 0."""
+    """Name of the parameter with the first value, or None for a field that begins at 0."""
     is_constant: bool = False
-    """True if no step changes the field: then all states of a run share its array."""
+    """True if no time step changes the field."""
 
     def shape(self, particles: int, dimension: int, phases: int) -> tuple[int, ...]:
-        """Return the shape of the field's values as a NumPy array."""
+        """Return the shape of the field as a NumPy array."""
         own = {Entry.VECTOR: (dimension,), Entry.FRACTIONS: (phases,)}.get(self.entry, ())
         return (particles if self.axis is Axis.PARTICLE else 1, *own)
 
 
 def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
-    """Raise `TypeError` for fields of the same name, or with an unknown or unfit parameter of first values."""
+    """Raise `TypeError` if two fields have the same name, or if a parameter does not fit as a first value."""
     names: set[str] = set()
     for field in fields:
         if field.name in names:
@@ -73,7 +74,7 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
 
 
 def first_values(fields: Iterable[StateField], parameters: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Return by name the first values of the fields that begin as one of the given parameters."""
+    """Return the first values of fields that begin with the value of a parameter, by field name."""
     found = {}
     for field in fields:
         if field.first is not None and field.first in parameters:
@@ -89,7 +90,6 @@ VELOCITIES = StateField("velocities", "m/s", Entry.VECTOR, first="initial_veloci
 
 
 def padded(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (n, 2) or (n, 3) as vectors (n, 3) in float64."""
     return np.hstack([vectors, np.zeros((len(vectors), 3 - vectors.shape[1]))])
 
 
@@ -99,7 +99,7 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return a view, as numbers of a shape, of an array of numbers, vectors or matrices, and of its adjoint."""
+    """Return a view of an array of numbers, vectors or matrices as numbers in a given shape."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -124,8 +124,8 @@ class Arrays(Staying):
         return list(self._arrays.values())
 
     def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """Return the arrays by argument name, ``drag_k`` for ``drag.k``; a ``suffix`` is "_dot" for tangents, "_bar"
-        for adjoints."""
+        """Return the arrays by kernel argument name, such as ``drag_k`` for ``drag.k``. The ``suffix`` is "_dot" for
+        tangents and "_bar" for adjoints."""
         if suffix not in self._named:
             self._named[suffix] = {argument(name) + suffix: array for name, array in self._arrays.items()}
         return self._named[suffix]
@@ -149,11 +149,11 @@ def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool
 
 
 class Fields(Arrays):
-    """The fields (n,) of sorted particles within a step, or their tangents or adjoints.
+    """Values of the sorted particles (n,) within a time step, or their tangents or adjoints.
 
-    ``x`` positions [m]; ``v`` velocities [m / s]; ``n`` number densities [-], 1 on the rest lattice; ``m`` masses over
-    the volume on the rest lattice [kg / m3], so that the density is m n; ``rho_0`` rest densities [kg / m3]; ``mu``
-    dynamic viscosities [Pa s].
+    ``x`` are positions [m], and ``v`` are velocities [m / s]. ``n`` are number densities [-], which are 1 on the rest
+    lattice. ``rho_0`` are rest densities [kg / m3], and ``mu`` are dynamic viscosities [Pa s]. ``m`` are masses divided
+    by the particle volume on the rest lattice [kg / m3], so that the density is m n.
     """
 
     @classmethod
@@ -163,15 +163,14 @@ class Fields(Arrays):
 
 
 class State(Arrays):
-    """The arrays on which a step depends besides parameters, by the names of declared fields; or their tangents or
-    adjoints.
+    """The arrays of a state by field name, or their tangents or adjoints.
 
-    Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,), a
-    number for each phase [-], in the scene's order of particles. In a batch the scenes are concatenated.
+    Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) with
+    one number for each phase [-]. Particles are in the order of the scene. In a batch the scenes are concatenated.
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
-        """Take the arrays of declared fields; ``batch`` is the number of scenes, None for a single one."""
+        """Take the arrays of declared fields. ``batch`` is the number of scenes, or None for a single scene."""
         super().__init__(arrays)
         self.fields, self.batch = fields, batch
         self._narrow: dict[int, dict[str, Any]] = {}
@@ -193,12 +192,12 @@ class State(Arrays):
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make an uninitialised later state of this run, which shares the arrays of constant fields."""
+        """Make a later state of this run with uninitialised arrays. It shares the arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
     def copy(self, earlier: Self | None = None) -> Self:
-        """Copy this state to new arrays, which share constant fields with an ``earlier`` state of the run if given."""
+        """Copy this state to new arrays. Constant fields are shared with an ``earlier`` state of the run."""
         kept = {} if earlier is None else {f.name: earlier[f.name] for f in self.fields if f.is_constant}
         own = {name: kept[name] if name in kept else wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
@@ -210,14 +209,16 @@ class State(Arrays):
         return type(self)(self.fields, views)
 
     def numbers(self, name: str) -> wp.array:
-        """Return a view of a field as a Warp array of numbers: vectors (n, 3), fractions (n, phases), in a batch
-        (batch, n, ...). Libraries with DLPack, such as PyTorch and JAX, use this array without a copy."""
+        """Return a view of a field as a Warp array of numbers. Vectors are (n, 3) and fractions (n, phases), and a
+        batch adds a first axis (batch, n, ...). Libraries with DLPack, such as PyTorch and JAX, use this array without
+        a copy."""
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
         return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
 
     def narrow(self, dimension: int) -> dict[str, Any]:
-        """Return views of all fields by name, in the shapes of `numpy`: NumPy arrays on a CPU, else Warp arrays."""
+        """Return views of all fields by name, in the shapes of `numpy`: NumPy arrays on a CPU, and Warp arrays on a
+        GPU."""
         if dimension not in self._narrow:
             on_host, vectors = self.positions.device.is_cpu, {f.name for f in self.fields if f.entry is Entry.VECTOR}
             whole = {name: self.numbers(name) for name in self.names}
@@ -227,7 +228,8 @@ class State(Arrays):
         return self._narrow[dimension]
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write fields by name: vectors (n, d), numbers (n,), fractions (n, phases), in a batch (batch, n, ...)."""
+        """Write fields by name. Vectors are (n, d), numbers (n,) and fractions (n, phases), and a batch adds a first
+        axis (batch, n, ...)."""
         for field in self.fields:
             if field.name in values:
                 given = np.asarray(values[field.name])
@@ -235,12 +237,12 @@ class State(Arrays):
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
     def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy every field, or those named in ``only``, to new arrays: vectors (n, dimension), numbers (n,), fractions
-        (n, phases), in a batch (batch, n, ...)."""
+        """Copy every field, or the fields named in ``only``, to new arrays. Vectors are (n, dimension), numbers (n,)
+        and fractions (n, phases), and a batch adds a first axis (batch, n, ...)."""
         return {name: array.copy() for name, array in self.views(dimension, only).items()}
 
     def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Return fields as `numpy` does; those of a state on the host are views."""
+        """Return fields as `numpy` does. If the state is on the host, the arrays are views."""
         names, lead = set(self.names if only is None else only), () if self.batch is None else (self.batch, -1)
         arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
         narrow = {f.name: a[:, :dimension] if f.entry is Entry.VECTOR else a for f, a in arrays.items()}
@@ -248,7 +250,7 @@ class State(Arrays):
 
 
 class StateSeries:
-    """States of one run, concatenated in shared arrays, so that one copy per field copies all states."""
+    """States of one run in shared arrays."""
 
     def __init__(self, like: State, length: int):
         self._like, self._length = like, length
@@ -273,26 +275,27 @@ class StateSeries:
 
 
 class Parameters(Arrays):
-    """The inputs of steps besides the state, by the names of parameters; or their tangents or adjoints.
+    """The parameters of a run by name, or their tangents or adjoints.
 
-    A parameter over time has the shape (members, steps), of vectors or numbers; a parameter of phases (members,
-    phases), an array (members, ...), and any other (members,). A member is a scene of a batch.
+    A parameter over time has the shape (members, steps), a parameter of phases (members, phases), an array (members,
+    ...), and any other parameter (members,). A member is a scene of a batch.
     """
 
     def __init__(self, arrays: Mapping[str, wp.array]):
         super().__init__(arrays)
         self._written: dict[str, np.ndarray | wp.array] = {}
-        """The last values of `set`, which need not be written again; for values copied on the device, the array."""
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
-        """Return the values that `set` has written, by name; `set_row` writes to them."""
+        """Return the values that `set` has written, by name. `set_row` changes these arrays."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write parameters by name, for all members or with an axis of members: a vector (d,) or vectors (steps, d),
-        numbers or arrays of numbers, or a Warp array. Only `set` and `set_row` may write to arrays that are set
-        again."""
+        """Write parameters by name, for all members or with a first axis for the members. A value is a vector (d,) or
+        vectors (steps, d), a number or an array of numbers, or a Warp array.
+
+        Only `set` and `set_row` may write to these arrays.
+        """
         for name, value in values.items():
             array, last = self[name], self._written.get(name)
             if isinstance(value, wp.array):
@@ -316,7 +319,8 @@ class Parameters(Arrays):
                 array.assign(np.broadcast_to(given, array.shape))
 
     def set_row(self, row: int, values: Mapping[str, np.ndarray]) -> None:
-        """Write one row, (members, d) vectors or (members,) numbers, of parameters whose rows `set` has written."""
+        """Write the values of parameters over time for one time step, as vectors (members, d) or numbers (members,).
+        Call `set` first."""
         for name, value in values.items():
             self._written[name][:, row] = value
             vectors = np.reshape(value, (len(value), -1))
@@ -327,15 +331,15 @@ class Parameters(Arrays):
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of the arrays of one solver, and their device. Arrays of a batch contain several scenes, one after the
-    other, and a launch has a thread for each particle of all scenes."""
+    """The sizes of a solver's arrays, and their device. The scenes of a batch are concatenated, and a launch has one
+    thread for each particle of all scenes."""
 
     particles: int
     phases: int
     precision: Precision
     device: Any
     batch: int | None = None
-    """Number of scenes; None for a single scene, whose arrays have no axis for scenes."""
+    """Number of scenes in a batch, or None for a single scene."""
     known: Known = REGISTRY
 
     @property
@@ -347,11 +351,12 @@ class Layout:
         return self.members * self.particles
 
     def sum_of(self, dtype: Any) -> TreeReduction:
-        """Make a function that sums numbers, vectors or matrices of a Warp type over the particles of each scene."""
+        """Make a function that sums numbers, vectors or matrices over the particles of each scene."""
         return sum_of(dtype, self.particles, self.device, self.members)
 
     def arrays(self, suffix: str = "", requires_grad: bool = False, **kinds: Any) -> dict[str, wp.array]:
-        """Make arrays (n,) of zeros over all particles, of Warp types by name; a ``suffix`` is added to the names."""
+        """Make arrays of zeros with an entry for each particle. ``kinds`` are Warp types by name, and ``suffix`` is
+        added to the names."""
         sizes = {f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}
         return zeros(sizes, self.device, requires_grad)
 

@@ -1,5 +1,5 @@
-"""The effect of the walls of one solid, or of all walls, on each particle by one term of a step, with derivatives, also
-with respect to the pose and size of moving solids.
+"""The effect of the walls of one solid, or of all walls, on each particle by one term of a step. Its derivatives
+include derivatives with respect to the pose and size of moving solids.
 
 A term is defined by its work W, a number that is linear in a vector ``bar`` of particle i. The sum over wall particles
 b, such as the acceleration by walls, is
@@ -7,16 +7,18 @@ b, such as the acceleration by walls, is
     A_i = sum_b w_b dW / dbar_i.
 
 Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
-``bar``; the adjoint is the gradient of W for the adjoint of A as ``bar``. With that adjoint particle i adds to the
+``bar``. The adjoint is the gradient of W for the adjoint of A as ``bar``. With that adjoint particle i adds to the
 adjoints of wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b.
 
-The surface point above the wall particle is s_b = c + R q_b, and the wall particle is at x_b = s_b - foot_b; R has
-turned the foot too. The velocity of the wall particle is (s_b - s_b^0) / dt + R u, with s_b^0 = c_0 + R_0 q_b at the
-start of the step. A scale sigma multiplies q_b by sigma, and w_b by sigma^(d - 1). Let a solid move by c', turn further
-by w' and grow by g' = sigma' / sigma, and let its pose at the start of the step change by c_0' and w_0'. The work is
-f^T c' + t^T w' + f_0^T c_0' + t_0^T w_0' + g g' with
+The nearest point on the surface is s_b = c + R q_b, with the middle c and the rotation R of the solid, and the wall
+particle is at x_b = s_b - foot_b. R has also rotated the vector foot_b. The velocity of the wall particle is (s_b -
+s_b^0) / dt + R u, with s_b^0 = c_0 + R_0 q_b at the start of the step. A scale sigma multiplies q_b by sigma, and w_b
+by sigma^(d - 1).
+
+Let a solid move by c', turn further by w' and grow by g' = sigma' / sigma, and let its pose at the start of the step
+change by c_0' and w_0'. The work is f^T c' + t^T w' + f_0^T c_0' + t_0^T w_0' + g g' with
 
     f = sum x_b^ + v_b^ / dt,    t = sum (x_b - c) x x_b^ + R q_b x v_b^ / dt + foot_b x foot_b^ + R u x v_b^,
     f_0 = -sum v_b^ / dt,        t_0 = -sum R_0 q_b x v_b^ / dt,
@@ -43,7 +45,6 @@ from cortado.particles.particle_kernels import MADE, made_kernel
 from cortado.particles.state import Layout, zeros
 
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
-"""f, t, f_0, t_0 and g / sigma."""
 BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
 LOOP = """\
 _x_i = at.x[i]
@@ -91,7 +92,6 @@ class _Loop:
         return f"{', '.join(f'_by_{name}' for name in self.term.parameters)} = wp.grad(_work)({self.arguments})"
 
     def text(self, given: Iterable[str], own: Iterable[str], body: Iterable[str]) -> str:
-        """Return the source of the loop with lines before and inside it; it reads entries of arrays not ``given``."""
         entries = [f"_{name}_i = at.{name}[i]" for name in self.read if name not in given]
         return LOOP.format(
             own="\n    ".join((*entries, *own)),
@@ -111,24 +111,23 @@ class _Loop:
 
 @dataclass(frozen=True)
 class WallTerm:
-    """A term of the forces by walls; ``make(discretisation)`` returns the function of its work W."""
+    """A term of the forces by walls. ``make(discretisation)`` returns the function of its work."""
 
     discretisation: Discretisation
     topic: str
     make: WorkMaker
     bar: str
     rubs: bool = False
-    """True if walls that slip freely are excluded."""
+    """True if walls with free slip are excluded."""
 
     @property
     def kernels(self) -> Kernels:
-        """Return kernels of the sum A, called ``total``, of its tangent ``total_dot``, and of its adjoint, the array
-        ``bar``. Kernel arguments include the ``constants`` of the work and ``solid``, a solid's number or
-        `ALL_WALLS`."""
+        """Return the kernels of the sum (``total``), of its tangent (``total_dot``), and of its adjoint (``bar``). The
+        kernel argument ``solid`` is the number of a solid or `ALL_WALLS`."""
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
-        """Return the kernel that turns the sum's adjoint into adjoints of a moving solid."""
+        """Return the kernel of the adjoints of a moving solid."""
         return solid_kernel(self.discretisation, self.topic, self.make, self.rubs)
 
 
@@ -197,7 +196,7 @@ def _kernels(of: WallTerm) -> Kernels:
 
 
 class SolidShares:
-    """The particles' terms of the adjoints of poses of solids in a step."""
+    """The contributions of particles to the adjoints of the poses of solids in a time step."""
 
     def __init__(self, walls: MovingWalls | None, layout: Layout):
         self._walls, self._pair = walls, layout.precision.pair
@@ -216,8 +215,7 @@ class SolidShares:
         over: int = ALL_WALLS,
         **arrays: Any,
     ) -> None:
-        """Add the terms of a sum ``over`` one solid or all by the kernel of ``kernel()``, called only if solids
-        move."""
+        """Add the contributions of a sum ``over`` one solid or all walls. ``kernel()`` makes the kernel."""
         if self._walls is None:
             return
         own = {"power": self._walls.sizes.power, "slides": self._walls.slides, "constants": self._pair(*constants)}
@@ -230,7 +228,7 @@ class SolidShares:
         return self._arrays[solid]
 
     def collect(self, solid: int) -> dict[str, wp.array]:
-        """Return the sums (members,) of a solid's terms, adjoints of poses and scale, and set the terms to 0."""
+        """Return the adjoints of the pose and the scale of a solid (members,), and reset the contributions to 0."""
         sums = zip(self._sums[solid], self._arrays[solid].values(), strict=True)
         found = dict(zip(BARS, (total(array) for total, array in sums), strict=True))
         for bar, given in self._whole[solid].items():
@@ -239,7 +237,7 @@ class SolidShares:
         return found
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
-        """Add values (members,) that do not come from particles to adjoints `BARS` of a solid, by name."""
+        """Add values (members,) to the adjoints of a solid. The names are in `BARS`."""
         for bar, one in given.items():
             add(one, self._whole[solid][bar])
 
@@ -260,11 +258,10 @@ def share_kinds(precision: Precision) -> dict[str, Any]:
 def solid_kernel(
     discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
 ) -> Any:
-    """Make the kernel of one sum, for `SolidShares.add`, in the Warp module of a ``topic``.
+    """Make the kernel of one sum for `SolidShares.add`. ``topic`` names its Warp module.
 
-    ``make(discretisation)`` returns W, a term of walls (see `pair_sums`) that returns a number and calls only functions
-    that Warp can differentiate. Parameters of W are entries of arrays of particle i, ``v_ij`` or ``v_j``, and
-    ``constants``. The kernel of a ``looped`` sum is for iteration k, and skips scenes that make fewer ``rounds``.
+    ``make(discretisation)`` returns the work of a term of walls. It may call only functions that Warp can
+    differentiate.
     """
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))

@@ -1,5 +1,4 @@
-"""Target pictures; and shaded pictures, films, plots and exports of runs. Differentiable pictures are in
-`cortado.render`."""
+"""Pictures, films, plots and exports of runs, and target pictures. Differentiable pictures are in `cortado.render`."""
 
 from cortado.lazy import getter
 

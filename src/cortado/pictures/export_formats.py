@@ -1,4 +1,4 @@
-"""Export of trajectories to files for other programs, in several formats, and to an xarray dataset."""
+"""Export trajectories to files for other programs, in several formats, and to an xarray dataset."""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -26,7 +26,7 @@ Advance = Callable[[], None]
 
 
 def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write a glTF file for each frame, with named parts, y up as in glTF, and linear colours; return the folder."""
+    """Write a glTF file for each frame, with the y axis up and linear colours, and return the folder."""
     import trimesh
 
     upright = Pose(run.up, np.zeros(3)).matrix
@@ -43,7 +43,8 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 def _write_series(run: Exported, folder: Path, advance: Advance, ending: str, text: Callable[[Any], Any]) -> list[str]:
-    """Write the files of each frame, whose text or bytes ``text`` returns; return entries for a ParaView collection."""
+    """Write the files of all frames. ``text`` returns the contents of a file. Return the entries of a ParaView
+    collection."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
         for part, (of, (name, what)) in enumerate(_files(run, number, frame, ending).items()):
@@ -61,7 +62,7 @@ def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) ->
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write a series of files with VTK, with all fields of the particles; return ``run.pvd``, which lists the files and
+    """Write a series of files with VTK, with all fields of the particles. Return ``run.pvd``, which lists the files and
     their times."""
     entries = _write_series(run, folder, advance, "vtp", _vtp)
     lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries, "  </Collection>", "</VTKFile>"]
@@ -70,7 +71,7 @@ def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 def _files(run: Exported, number: int, frame: ExportedFrame, ending: str) -> dict[str, tuple[str, Any]]:
-    """Return names and contents of a frame's files, by part; a solid at rest has one file for all frames."""
+    """Return the names and contents of the files of a frame."""
     found: dict[str, Any] = {"particles": (_numbered("particles", number, ending), frame)}
     if frame.surface is not None:
         found["surface"] = _numbered("surface", number, ending), frame.surface
@@ -98,11 +99,11 @@ def _linear(colours: Any) -> Any:
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write ``run.usdc`` with the mesh ``/run/surface``, the points ``/run/particles``, and for each solid a transform
-    ``/run/solid_NAME`` with a mesh; return its path.
+    """Write ``run.usdc`` and return its path. The file has the mesh ``/run/surface``, the points ``/run/particles``,
+    and for each solid a transform ``/run/solid_NAME`` with a mesh.
 
-    Frame k of `WholeFrames` is at time code k, and the file stores the number of time codes per second. Lengths are
-    metres, colours linear.
+    Frame k of `WholeFrames` is at time code k, and the file stores the frame rate. Lengths are in metres, and colours
+    are linear.
     """
     pxr = _pxr()
     path = folder / "run.usdc"
@@ -200,7 +201,6 @@ class _Writer:
         orient.Set(gf.Quatd(float(turn[3]), gf.Vec3d(*turn[:3])), code)
 
     def _floats(self, values: np.ndarray) -> Any:
-        """Return numbers (n,) or (n, k) as a USD array in float32."""
         vt, own = self._pxr.Vt, np.ascontiguousarray(values, dtype=np.float32)
         kind = vt.FloatArray if own.ndim == 1 else {2: vt.Vec2fArray, 3: vt.Vec3fArray}[own.shape[1]]
         return kind.FromNumpy(own)
@@ -221,8 +221,7 @@ def _pxr() -> Any:
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:
-    """Return the text of a VTP file: a vertex per particle with velocity [m/s] and all fields, or a mesh with
-    triangles, normals and, of a surface, velocities [m/s]."""
+    """Return the text of a VTP file with the particles of a frame or with a mesh."""
     colours = {"colour": srgb_bytes(what.colours)}
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
@@ -264,7 +263,6 @@ def _array(name: str, values: np.ndarray) -> Any:
 
 @cache
 def _vtk() -> Any:
-    """Import the parts of VTK in use; importing all of it takes seconds."""
     try:
         from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkIOXML
         from vtkmodules.util import numpy_support
@@ -286,8 +284,7 @@ FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
 def export(
     trajectory: Trajectory, folder: str | Path, to: str, scene: Scene | str | Path, simulation: Computed = None
 ) -> Path:
-    """Export a trajectory for another program; see `Trajectory.export`. Return the file to open, or a series'
-    folder."""
+    """Export a trajectory to files for another program, as `Trajectory.export` does. Return the path to open."""
     if to not in FORMATS:
         raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
     if not len(trajectory):
@@ -314,7 +311,7 @@ def export(
 
 
 def labelled(trajectory: Trajectory) -> Any:
-    """Return a trajectory as a dataset of xarray; see `Trajectory.to_xarray`."""
+    """Return a trajectory as a dataset of xarray. See `Trajectory.to_xarray`."""
     try:
         import xarray
     except ImportError as error:

@@ -1,7 +1,7 @@
-"""The data of a run that exporters write in every frame: the particles, the surface of the fluid, and the solids.
+"""The data of a run for export: the particles, the surface of the fluid, and the solids.
 
-Surfaces end at container walls, as in pictures, and enclose the volume of their particles. To reach this volume, all
-points around a connected body of fluid are moved in or out by the same distance.
+Surfaces end at container walls and enclose the volume of their particles. To reach this volume, all surface points of a
+connected body of fluid are moved in or out by the same distance.
 """
 
 import re
@@ -34,46 +34,43 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import CylinderContainer
 
 EVEN = 1e-6
-"""Relative difference of time intervals below which recorded frames count as evenly spaced."""
+"""Relative tolerance for evenly spaced frames."""
 DIGITS = (0, 1, 2, 3)
-"""Numbers of decimals that a frame rate may have if recorded frames are not evenly spaced."""
 UNLIKE = 0.05
-"""Relative difference between the surface's and the fluid's volume above which a message reports it."""
+"""Relative difference between the enclosed volume and the fluid's volume above which a message is printed."""
 ROUND = 0.05
 LINKED = 1.25
-"""Distance in spacings below which two particles belong to one body of fluid."""
+"""Greatest distance of adjacent particles in a connected body of fluid [spacings]."""
 NEAR_SURFACE = 2.0
-"""Distance in spacings within which a particle without link to a surface belongs to the body of the nearest surface."""
+"""Greatest distance from a surface for isolated particles that count towards its volume [spacings]."""
 MOST_SHIFT = 1.0
-"""Greatest displacement of a point in one pass, in spacings."""
+"""Greatest displacement of a surface point in one pass [spacings]."""
 PASSES = 2
-"""Number of passes; each moves points outwards, and then back to a wall that they have crossed."""
+"""Number of passes that correct the enclosed volume."""
 ROUNDS = 20
 IN_PLACE = 1e-6
-"""Round-off in spacings: points that a rotation to the container's axes and back moves by less count as unmoved."""
 
 
 @dataclass(frozen=True)
 class WholeFrames:
-    """Evenly spaced frames of an animation: frame k, at time start + k / rate, is a recorded state extrapolated to that
-    time."""
+    """Evenly spaced frames of an animation. Frame k is at the time start + k / rate. Its particles are extrapolated
+    from a recorded state to this time."""
 
     rate: float
-    """[1/s] frame rate"""
+    """Frame rate [1/s]."""
     times: NDArray[np.float64]
-    """(frames,) [s]"""
+    """Times of the frames (frames,) [s]."""
     recorded: NDArray[np.intp]
-    """(frames,) number of the recorded state for each frame: the nearest in time or, in a run with marks, the first
-    state at or after the frame's time"""
+    """Number of the recorded state for each frame (frames,)."""
     shifts: NDArray[np.float64]
-    """(frames,) [s] time of the frame minus time of its recorded state; 0 if recorded states are evenly spaced"""
+    """Time of each frame minus the time of its recorded state (frames,) [s]."""
     left_out: float
-    """[s] time from the last frame to the end of the run"""
+    """Time from the last frame to the end of the run [s]."""
 
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
-        """Choose frames for states recorded at ``times`` (m,) [s]: at their ``marks``, the states themselves if they
-        are evenly spaced, or at a round frame rate."""
+        """Choose frames for states recorded at ``times`` (m,) [s]. Frames are at the ``marks``, or at the states if the
+        states are evenly spaced. Otherwise a round frame rate is chosen."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -95,7 +92,7 @@ class WholeFrames:
 
     @property
     def in_words(self) -> str:
-        """Describe how the frames differ from recorded states; empty if they are equal."""
+        """Describe how the frames differ from recorded states, or return an empty text."""
         found = []
         if self.shifts.any():
             most = 1e3 * float(np.abs(self.shifts).max())
@@ -106,8 +103,7 @@ class WholeFrames:
 
 
 def _round_rate(times: NDArray[np.float64]) -> float:
-    """Return the frame rate [1/s] with the fewest digits that assigns each state but the last a separate frame, or the
-    mean rate."""
+    """Return a round frame rate [1/s] that gives each recorded state a separate frame, or the mean rate."""
     usual = times[:-1]
     mean = (len(usual) - 1) / float(usual[-1])
     for digits in DIGITS:
@@ -120,17 +116,17 @@ def _round_rate(times: NDArray[np.float64]) -> float:
 @dataclass(frozen=True)
 class Pose:
     turn: Points
-    """(3, 3) rotation matrix"""
+    """Rotation matrix (3, 3)."""
     position: Points
-    """(3,) [m]"""
+    """Position (3,) [m]."""
 
     def of(self, mesh: Mesh) -> Mesh:
-        """Return a solid's mesh at this pose."""
+        """Return the mesh of a solid at this pose."""
         return replace(mesh, points=mesh.points @ self.turn.T + self.position, normals=mesh.normals @ self.turn.T)
 
     @property
     def matrix(self) -> Points:
-        """(4, 4) for column vectors."""
+        """Return the pose as a matrix (4, 4) for column vectors."""
         return np.block([[self.turn, self.position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
@@ -140,29 +136,29 @@ class ExportedSolid:
     part: str
     """Unique name in files: "solid_" and letters, digits and underscores."""
     mesh: Mesh
-    """About the solid's middle, not rotated."""
+    """Mesh relative to the solid's middle, without rotation."""
     moves: bool
 
 
 @dataclass(frozen=True)
 class ExportedFrame:
     time: float
-    """[s]"""
+    """Time [s]."""
     positions: Points
-    """(n, 3) [m]"""
+    """Positions of the particles (n, 3) [m]."""
     velocities: Points
-    """(n, 3) [m/s]"""
+    """Velocities of the particles (n, 3) [m/s]."""
     colours: Points
-    """(n, 3) linear"""
+    """Linear colours of the particles (n, 3)."""
     fields: Mapping[str, np.ndarray]
-    """(n,) or (n, k) by name: the mass fractions of several phases, and recorded quantities"""
+    """Mass fractions and recorded quantities by name, (n,) or (n, k)."""
     surface: Mesh | None
-    """Surface of the fluid; None in 2-D, and if the particles are too far apart for a surface."""
+    """Surface of the fluid, or None in 2-D and for scattered particles."""
     poses: Mapping[str, Pose]
 
 
 class Exported:
-    """A run and its scene in the form that exporters write; raise `InputError` if colours cannot be computed."""
+    """A run and its scene in the form for export. Raises `InputError` if colours cannot be computed."""
 
     def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Computed = None):
         self.times, self.scene = trajectory.times, scene
@@ -175,7 +171,8 @@ class Exported:
             self.solids.append(_solid(one, part, name in trajectory.solids))
         self._trajectory = trajectory
         self._held = (0.0, 0.0, 1.0, 1.0)
-        """|volume within the surface / fluid's volume - 1|, time [s] and both volumes [m³], where this is greatest."""
+        """Greatest relative difference of the volumes so far, its time [s], and the volumes of surface and
+        fluid [m³]."""
 
     @cached_property
     def whole(self) -> WholeFrames:
@@ -183,7 +180,7 @@ class Exported:
 
     @property
     def series(self) -> WholeFrames | None:
-        """The frames of a series of files: those at the run's marks, or None (all states) for a run without marks."""
+        """Frames of a series of files, or None if all recorded states are written."""
         return None if self._trajectory.marks is None else self.whole
 
     @property
@@ -192,11 +189,12 @@ class Exported:
 
     @property
     def up(self) -> Points:
-        """Rotation (3, 3) that turns the direction opposite to gravity to y; the identity in 2-D."""
+        """Rotation (3, 3) that turns the upward direction of the scene, against gravity, to the y axis. It is the
+        identity in 2-D."""
         return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """Yield all recorded states or the ``whole`` frames, one at a time because surfaces need much memory."""
+        """Yield all recorded states or the ``whole`` frames, one at a time to save memory."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
         solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
@@ -205,16 +203,14 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """Describe the difference between the volumes within exported surfaces and the fluid's; empty if it is
-        small."""
+        """Describe the difference between the volumes of exported surfaces and of the fluid. A small difference gives
+        an empty text."""
         unlike, time, held, whole = self._held
         if unlike <= UNLIKE:
             return ""
         return f"at {time:.4g} s the surface encloses {held:.4g} m³, where there are {whole:.4g} m³ of fluid"
 
     def _frame(self, frame: Frame, recorded: int, solids: SolidMotions, number: int) -> ExportedFrame:
-        """Make an exported frame from a state near a recorded one, with the solids' poses from frame ``number`` of
-        their motions."""
         shown = those(is_out(self.scene, frame.others, len(frame.positions)))
         within = self.scene.domain.wrapped(frame.positions[shown])
         positions, velocities = in_space(np.float64(within)), in_space(np.float64(frame.velocities[shown]))
@@ -265,8 +261,7 @@ def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
 
 
 def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, np.ndarray, Points]:
-    """Make points, triangles and normals of a 2-D outline, extruded perpendicular to the plane by a tenth of its
-    size."""
+    """Extrude a 2-D outline perpendicular to the plane by a tenth of its size. Return points, triangles and normals."""
     start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
     along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
     outwards = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
@@ -278,7 +273,7 @@ def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, n
 
 
 def enclosed(points: Points, triangles: np.ndarray) -> float:
-    """Return the volume [m³] within triangles (t, 3) of points (p, 3) [m]."""
+    """Return the volume [m³] inside triangles (t, 3) of points (p, 3) [m]."""
     a, b, c = (points[corner] - points[0] for corner in triangles.T)
     return float(_sixth(a, b, c).sum())
 
@@ -289,9 +284,11 @@ Kept = Callable[[Points], Points]
 def with_volume(
     points: Points, triangles: np.ndarray, ways: Points, places: Points, spacing: float, kept: Kept
 ) -> Points:
-    """Move the points (p, 3) [m] of a surface along ``ways`` (p, 3), unit vectors outwards or 0, so that each body of
-    fluid encloses ``spacing``³ for each of its particles at ``places`` (n, 3) [m]; ``kept`` returns points beyond a
-    wall to the wall."""
+    """Move the points (p, 3) [m] of a surface so that it encloses the volume of its particles, ``spacing``³ each.
+
+    ``ways`` (p, 3) are outward unit vectors or 0, and ``places`` (n, 3) [m] are positions of particles. ``kept`` moves
+    points beyond a wall back to the wall.
+    """
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
@@ -307,8 +304,8 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number the bodies of fluid; return the numbers for points (p,) and particles (n,), -1 for particles without a
-    body."""
+    """Number the connected bodies of fluid. Return the body's number for each surface point (p,) and for each particle
+    (n,), or -1."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -334,8 +331,8 @@ def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: floa
 def _volumes(
     points: Points, ways: Points, triangles: np.ndarray, bodies: np.ndarray, count: int
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return a function from distances (bodies,) [m], by which points move along their ``ways``, to volumes (bodies,)
-    [m³] and their derivatives [m²]."""
+    """Return a function that maps displacements of surfaces (bodies,) [m] to enclosed volumes (bodies,) [m³] and their
+    derivatives [m²]."""
     (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points, ways))
     own = bodies[triangles[:, 0]]
     terms = (
@@ -349,13 +346,13 @@ def _volumes(
 
 
 def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
-    """Return a sixth (t,) of the determinants of vectors (t, 3)."""
     return np.einsum("tk,tk->t", a, np.cross(b, c)) / 6.0
 
 
 def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Mesh:
-    """Make the fluid's surface in the scene's axes, for particles at positions (n, 3) [m] with colours (n, 3), so that
-    it ends at walls and encloses the particles' volume. Raise `ComputationError` without a surface."""
+    """Make the surface of the fluid in the axes of the scene, for particles at positions (n, 3) [m] with colours (n,
+    3). The surface ends at walls and encloses the volume of the particles. Raises `ComputationError` without a surface.
+    """
     launch, stage = BandLauncher(wp.get_device(device)), replace(stage, solids=())
     with WARP:
         own = particles_of(stage, positions, colours, launch)
@@ -374,7 +371,7 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
 
 
 def _in_room(stage: Stage, points: Points) -> Points:
-    """Move points (p, 3) [m], in picture axes, into the container, along the axes where walls cut the fluid."""
+    """Move points (p, 3) [m] in picture axes into the container."""
     if not stage.cuts:
         return points
     lower, upper = stage.room

@@ -37,22 +37,22 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 Computed = Callable[[], Simulation] | None
-"""Makes the simulation that computes colours which were not recorded."""
+"""A function that makes the simulation for colours that were not recorded."""
 Around = tuple[tuple[int, ...], tuple[int, ...]]
-"""Numbers of the frames that a film shows before and after a frame, nearest first."""
+"""Numbers of the frames before and after a frame, the nearest first."""
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
-"""Draws frame number k, given the frames around it: a linear picture (rows, columns, 3), from 0 to 1."""
+"""A function that draws frame number k as a linear picture (rows, columns, 3) from 0 to 1. Its second argument is the
+frames before and after k."""
 
 
 MOST_PICTURES = 9
 LEAST_PIXELS = 64
 AIR = 1.25
-"""Greatest ratio of a picture's height to the height of its contents at the picture's width."""
+"""Greatest height of a picture, relative to the height of its contents at full width."""
 SLOW = 0.1
-"""Film speed (simulated seconds per second) below which fluid at rest is not averaged over frames."""
+"""Speed of a film below which fluid at rest is not averaged over frames [simulated seconds per second]."""
 TELLING_FRAMES = 100
-"""Approximate number of frames whose solid poses the camera must include."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,14 @@ class Page:
     panels: Sequence[Panel]
     composed: Callable[[list[Points]], Points] = itemgetter(0)
     fingerprint: str = ""
-    """Checksum of all data shown in the pictures; empty if unknown."""
+    """Checksum of all data in the pictures, or an empty text if unknown."""
     notes: str = ""
 
     def image(self, frame: int) -> Points:
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
     def images(self, frames: Sequence[int], begin: int = 0, window: int = WINDOW) -> Iterator[Points]:
-        """Yield the pictures of a film's frames from ``begin`` on, each drawn with ``window`` frames before and after
-        it, while a thread draws the next."""
+        """Yield the pictures of a film's frames from ``begin`` on. A thread draws the next picture meanwhile."""
         shown, count = range(begin, len(frames)), len(self.panels)
         drawn = _ahead(count, (panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels))
         return (self.composed(list(islice(drawn, count))) for _ in shown)
@@ -79,7 +78,7 @@ def _around(frames: Sequence[int], n: int, window: int) -> Around:
 
 
 class FilmedRun:
-    """A `Panel` for the states of one run; in 3-D it keeps fluid at rest from flickering."""
+    """A `Panel` that draws the states of one run."""
 
     def __init__(self, artist: PlanePainter | SpacePainter, state: Callable[[int], State]):
         self._artist, self._state, self._stills = artist, state, dict[int, Any]()
@@ -98,11 +97,11 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Fit several stages into a page of the first stage's picture size minus ``spare`` columns, with one scale and
-    region; return the stages and the number of pictures in a row.
+    """Fit several stages into one page with a common scale and region. The page has the picture size of the first stage
+    minus ``spare`` columns. Return the stages and the number of pictures in a row.
 
     Raises:
-        InputError: pictures would be too small.
+        InputError: the pictures would be too small.
     """
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
@@ -120,8 +119,8 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """Return how many of ``count`` pictures to place in a row, so that contents of width and height ``size`` (2,) are
-    large and few places of the page stay empty."""
+    """Choose how many of ``count`` pictures to place in a row, so that the contents are large. ``size`` (2,) is the
+    width and height of the contents."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -132,14 +131,14 @@ def in_a_row(count: int, size: Points, page: Picture) -> int:
 
 
 def lacking(scene: Scene) -> str | None:
-    """Return a sentence about a missing package that shaded pictures of the scene need; None if all are installed."""
+    """Return a sentence about a missing package for shaded pictures of the scene, or None."""
     if (scene.picture or Picture()).film_frames == 0 or find_spec("av"):
         return None
     return "Shaded pictures need PyAV, which is not installed: pip install av."
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """Write a film of the frames that ``pace`` chooses; a second call after an interruption continues the film."""
+    """Write a film of the frames that ``pace`` chooses. After an interruption, a second call continues the film."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -153,7 +152,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
 
 
 def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
-    """Yield images in order; draw up to ``count`` images ahead in a thread."""
+    """Yield images in order. Up to ``count`` further images are drawn in advance in a thread."""
     painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
     try:
         coming = deque(painter.submit(next, images, None) for _ in range(count))
@@ -174,9 +173,8 @@ class ShownRun:
     scene: Scene
     trajectory: Trajectory
     values: NDArray | None = None
-    """(frames, n) values for a colour scale; None to use the colours of phases."""
+    """Values for a colour scale (frames, n), or None to use the colours of phases."""
     unit: str | None = None
-    """Unit of values."""
 
     @cached_property
     def stage(self) -> PlaneStage | Stage:
@@ -228,8 +226,8 @@ class ShownRun:
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left emitters and are in no drain, from the fields `Frame.others`.
-    If the scene starts without fluid, the first layers of emitters count as out."""
+    """Return a mask (n,) of the particles that have left emitters and are not in a drain. If the scene starts without
+    fluid, the first layers of emitters are included. ``others`` are the fields of `Frame.others`."""
     found = ~waits(scene, others, particles)
     for _, first, sample in () if found.any() else samples(scene, particles):
         found[first : first + sample.layer] = True
@@ -237,8 +235,8 @@ def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[n
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the places (frames, n, d) [m] of particles in pictures: waiting ones at the emitter's opening, and
-    particles taken by a drain in its middle."""
+    """Return the positions of particles in pictures (frames, n, d) [m]. Particles that wait in an emitter are at its
+    opening, and particles in a drain are at its middle."""
     places, others, count = trajectory.positions, trajectory.others, trajectory.particles
     out = np.array([is_out(scene, frame.others, count) for frame in (trajectory if scene.emitter else ())])
     for name, first, sample in samples(scene, count):
@@ -251,13 +249,13 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """Index arrays (n, ...) by a mask (n,); a slice avoids a copy if the mask is True everywhere."""
+    """Convert a mask (n,) to an index of arrays (n, ...). A mask that is True everywhere becomes a slice."""
     return slice(None) if out.all() else out
 
 
 def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the times (frames, n) [s] since particles left an emitter, assuming constant emission between frames.
-    Other particles have the time since the start of the run; waiting particles have 0."""
+    """Return the times (frames, n) [s] since particles left an emitter. Particles from the start of the run have the
+    time since the start, and particles still in an emitter have 0."""
     since, count = np.full(trajectory.positions.shape[:2], float(trajectory.times[0])), trajectory.particles
     for name, first, sample in samples(scene, count):
         if emitted_name(name) in trajectory.others:
@@ -268,8 +266,7 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Computed = None) -> NDArray | None:
-    """Return the values (frames, n) that colour particles in pictures, recorded or computed; None for the colours of
-    phases.
+    """Return the values (frames, n) for the colours of particles, or None for the colours of phases.
 
     Raises:
         InputError: the quantity was not recorded and cannot be computed.

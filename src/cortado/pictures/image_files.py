@@ -1,7 +1,7 @@
-"""Target pictures of latte art; reading and writing of picture files; and reading of video frames.
+"""Draw target pictures of latte art, read and write picture files, and read video frames.
 
-A picture is a float64 array (rows, columns, 3) of linear red, green and blue from 0 to 1; its first row is the top. A
-resolution is (columns, rows), as in a scene, or one number for a square.
+A picture is a float64 array (rows, columns, 3) of linear red, green and blue from 0 to 1, with the top row first. A
+resolution is (columns, rows), or one number for a square.
 """
 
 from __future__ import annotations
@@ -25,23 +25,22 @@ Picture = NDArray[np.float64]
 Resolution = int | tuple[int, int]
 Colour = tuple[float, float, float]
 Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
-"""Tests whether points x, y are inside; from bottom to top a shape extends from -1 to 1."""
+"""A function that tests whether points x, y are inside a shape. The shape extends from y = -1 to y = 1."""
 
 MILK: Colour = (0.96, 0.93, 0.86)
 COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
 DRAWN = 100.0
-"""[bytes per pixel]"""
+"""Memory for drawing [bytes per pixel]."""
 SAMPLES = 6
-"""Number of sample points along each side of a pixel."""
+"""Number of sample points along the side of a pixel."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 MOST_BYTES = 2**28
-"""[bytes]"""
+"""Greatest size of a picture file [bytes]."""
 MOST_PIXELS = 2**26
 MOST_PIXELS_KEPT = 2**24
 PIXELS_AT_ONCE = 2**20
 ROUNDING = 0.01
-"""Fraction of a picture above which cropping causes a warning; rounding the sides crops less."""
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
 
 
@@ -55,12 +54,12 @@ def heart(
     coffee: Colour = COFFEE,
     background: Colour = WHITE,
 ) -> Picture:
-    """Draw a heart, its tip down.
+    """Draw a heart with the tip at the bottom.
 
     Args:
-        resolution: columns and rows of pixels, or one number for both.
-        cup: radius of a round cup in the middle, relative to half of the shorter side of the picture; outside the cup
-            is the background. None: coffee everywhere.
+        resolution: columns and rows of pixels, or one number for a square.
+        cup: radius of a round cup in the middle, relative to half of the shorter side of the picture. The background
+            surrounds the cup. By default the whole picture is filled with coffee.
         size: size of the shape, relative to the cup or, without a cup, to the shorter side of the picture.
         milk, coffee, background: red, green and blue, linear, from 0 to 1.
 
@@ -81,7 +80,7 @@ def rosetta(
 ) -> Picture:
     """Draw a rosetta: layers of milk like fern leaves, pulled together along a stem, with a small heart on top.
 
-    The arguments ``resolution``, ``cup``, ``size``, ``milk``, ``coffee`` and ``background`` are those of `heart`.
+    The arguments ``resolution``, ``cup``, ``size``, ``milk``, ``coffee`` and ``background`` are as in `heart`.
 
     Example: ``target = cortado.pictures.rosetta((128, 128), cup=0.9)  # (128, 128, 3)``
     """
@@ -90,14 +89,14 @@ def rosetta(
 
 @public
 def read_picture(path: str | Path, resolution: Resolution | None = None) -> Picture:
-    """Read the picture at ``path``, in one of the `FORMATS`; transparent parts are shown on white.
+    """Read the picture at ``path``, in one of the `FORMATS`. Transparent parts are shown on white.
 
     Args:
-        resolution: wanted columns and rows: the largest central part with this aspect ratio is resampled, in linear
+        resolution: wanted columns and rows. The largest central part with this aspect ratio is resampled in linear
             light. None keeps the original pixels.
 
     Raises:
-        InputError: the file is missing, is no picture, or has too many pixels.
+        InputError: the file is missing, is not a picture, or has too many pixels.
 
     Example: ``target = cortado.pictures.read_picture("target.png", (64, 48))  # (48, 64, 3)``
     """
@@ -110,12 +109,13 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 
 def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
-    """Return the largest central part of a Pillow picture with this aspect ratio, resampled in linear light."""
+    """Resample the largest central part of a Pillow picture that has the aspect ratio of ``resolution``, in linear
+    light."""
     return _whole(picture) if resolution == picture.size else _resampled(picture, *resolution)
 
 
 def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
-    """Open a picture file with Pillow, of at most ``most`` pixels; raise `InputError` as `read_picture` does."""
+    """Open a picture file of at most ``most`` pixels with Pillow. Raises `InputError` as `read_picture` does."""
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
@@ -141,8 +141,8 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Warn if cropping a picture of ``size`` pixels to the aspect ratio of ``shape`` removes a part; the message begins
-    with ``found``."""
+    """Warn if a picture of ``size`` pixels must be cropped to the aspect ratio of ``shape``. The message begins with
+    ``found``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < 1.0 - ROUNDING:
@@ -151,7 +151,6 @@ def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) 
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Return left, top, right and bottom of the largest central part of a picture with this aspect ratio."""
     (width, height), (columns, rows) = size, shape
     scale = min(width / columns, height / rows)
     left, top = 0.5 * (width - scale * columns), 0.5 * (height - scale * rows)
@@ -164,11 +163,12 @@ def _too_many(path: str | Path, found: str, most: int) -> InputError:
 
 @public
 def write_picture(path: str | Path, image: ArrayLike) -> Path:
-    """Write a linear image (rows, columns, 3) as a PNG with 8 bits of sRGB, clipped to 0..1, and return its path.
+    """Write a linear ``image`` (rows, columns, 3) to a PNG file at ``path`` with 8 bits of sRGB. Values are clipped to
+    0..1. Return the path.
 
     Raises:
-        InputError: another shape, whole numbers, values that are not finite or up to 255, a name that does not end in
-            .png, or a file that cannot be written.
+        InputError: the image has a wrong shape, is an array of integers, or has values that are not finite or look like
+            0..255; the name does not end in .png; or the file cannot be written.
 
     Example: ``cortado.pictures.write_picture("last.png", simulation.renderer().render(trajectory[-1]))``
     """
@@ -196,8 +196,7 @@ def _mixed(share: Picture, inside: Picture, outside: Picture) -> Picture:
 
 
 def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
-    """Return the fraction (rows, columns, 1) of each pixel inside a shape; the shorter side extends from -1 to 1, y
-    upwards."""
+    """Return the fraction of each pixel inside a shape (rows, columns, 1)."""
     half = 0.5 * min(columns, rows)
     covered = np.zeros((rows, columns, 1))
     offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
@@ -210,7 +209,7 @@ def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
 
 
 def _in_heart(x: Any, y: Any) -> Any:
-    """Test if points are inside the sextic (x^2 + y^2 - 1)^3 = x^2 y^3 (y from -1 to 1.2367), shifted and scaled."""
+    """Test whether points x, y are inside the heart curve (x^2 + y^2 - 1)^3 = x^2 y^3, shifted and scaled."""
     x, y = 1.1183 * x, 1.1183 * y + 0.1183
     return (x**2 + y**2 - 1.0) ** 3 < x**2 * y**3
 
@@ -233,7 +232,6 @@ def _columns_and_rows(resolution: Resolution) -> tuple[int, int]:
 
 
 def _bands(picture: Any) -> Iterator[tuple[int, Any]]:
-    """Yield blocks of a few opaque rows, each with the number of its first row, to save memory."""
     from PIL import Image
 
     height = max(PIXELS_AT_ONCE // picture.width, 1)
@@ -267,7 +265,7 @@ def _resampled(picture: Any, columns: int, rows: int) -> Picture:
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 MOST_BYTES_OF_VIDEO = 2**33
-"""[bytes]"""
+"""Greatest size of a video file [bytes]."""
 
 
 def read_frames(
@@ -277,14 +275,15 @@ def read_frames(
     frame_rate: float | None = None,
     every: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read times (frames,) [s] since the first frame, and frames (frames, rows, columns, 3), linear, from 0 to 1.
+    """Read frames (frames, rows, columns, 3) in linear light from 0 to 1, and their times (frames,) [s] since the first
+    frame. Return the times and the frames.
 
     Args:
         path: a video, or a folder of pictures, which are read in the order of their names.
-        resolution: wanted columns and rows: the largest central part with this aspect ratio is resampled.
-        crop: left, top, right and bottom of the part of each frame to use, in pixels of the frame as players show it;
-            by default the full frame.
-        frame_rate: frames per second, needed for a folder; by default the rate of the video.
+        resolution: wanted columns and rows. The largest central part with this aspect ratio is resampled.
+        crop: left, top, right and bottom of the used part of each frame, in pixels of the frame as players show it. By
+            default the whole frame is used.
+        frame_rate: frames per second, needed for a folder. The default is the frame rate of the video.
         every: read only every ``every``-th frame.
 
     Raises:
@@ -323,8 +322,7 @@ def _decoded(path: str | Path) -> Iterator[tuple[float, Any]]:
 
 
 def _upright(frame: Any) -> Any:
-    """Return the picture of a frame as players show it, turned and mirrored by the frame's matrix (ISO/IEC 14496-12,
-    8.3.2)."""
+    """Return the picture of a frame as players show it, turned and mirrored (ISO/IEC 14496-12, 8.3.2)."""
     from PIL.Image import Transpose
 
     picture = frame.to_image()

@@ -1,6 +1,6 @@
 """HTML for notebooks and run folders.
 
-Notebooks show an object as its repr with a picture, a film, an animation or a table below. The report.html of a run
+Notebooks show an object as its repr, followed by a picture, a film, an animation or a table. The report.html of a run
 folder embeds pictures and films, and opens from disk without a network.
 """
 
@@ -35,7 +35,7 @@ from cortado.scene.parameter_values import UNITS, Values
 from cortado.simulation import Simulation
 
 Figures = list[tuple[str, str | Path]]
-"""(caption, path) of each picture or video"""
+"""Caption and path of each picture or video."""
 _KINDS = {
     **{".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml", ".gif": "image/gif"},
     **{".webp": "image/webp", ".mp4": "video/mp4", ".webm": "video/webm"},
@@ -47,22 +47,22 @@ MOST_WRITTEN_OUT = 12
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report; empty parts are left out."""
+    """A section of a report. Empty parts are left out."""
 
     title: str
     words: Sequence[object] = ()
     failures: Sequence[object] = ()
     figures: Sequence[tuple[str, str | Path]] = ()
-    """(caption, path) of png, jpg, svg, gif, webp, mp4 or webm"""
+    """Caption and path of each figure, which is a png, jpg, svg, gif, webp, mp4 or webm file."""
     view: str = ""
     head: Sequence[str] = ()
     rows: Sequence[Sequence[object]] = ()
-    """The first entry of each row is its name."""
+    """Rows of a table. The first entry of each row is its name."""
 
 
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
-    """Write the report of a run and return its path; the page ends with the run's command, scene and environment. Raise
-    `InputError` for a picture that cannot be embedded or a page that cannot be written."""
+    """Write the report of a run and return its path. The page ends with the run's command, scene and environment.
+    Raises `InputError` for a picture that cannot be embedded or a page that cannot be written."""
     parts = "\n".join(_section(section) for section in sections)
     player = script() if any(section.view for section in sections) else ""
     look = f"{Path(__file__).with_name('report.css').read_text(encoding='utf-8')}\n{style()}"
@@ -91,7 +91,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 
 
 def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
-    """Add a picture or film that was drawn later to the run's report, if there is a report; each file is shown once."""
+    """Add a new picture or film to the report of a run. Nothing happens if the run has no report."""
     page = folder.report.read_text(encoding="utf-8") if folder.report.exists() else ""
     before, again, after = page.partition(AGAIN)
     if again:
@@ -102,7 +102,7 @@ def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
 
 
 def written(value: Any) -> str:
-    """Return a number or a few numbers as text; for many numbers, their count and range."""
+    """Return a few numbers as text. For many numbers, return their count and range."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         return str(value)
@@ -177,9 +177,9 @@ def _details(label: str, path: Path) -> str:
 
 
 IN_MOTION = 1_000_000
-"""[bytes]"""
+"""Greatest size of an animation in a notebook [bytes]."""
 MOST_NUMBERS = 6
-"""Greatest number of a parameter's values in the table; for more values their range is shown."""
+"""Greatest number of values of a parameter in the table. For larger parameters the table shows the range."""
 HEAD = ("parameter", "unit", "first guess", "found")
 
 
@@ -214,8 +214,8 @@ def film_page(film: Film) -> str:
 
 
 def result_page(found: object, message: str, problem: Any, start: Values, best: Values, losses: Any) -> str:
-    """Return HTML of the result of a search; for a `Problem` with pictures of the runs with the first and with the best
-    parameters, unless they diverge."""
+    """Return HTML of the result of a search. For a `Problem` it includes pictures of the runs with the first and with
+    the best parameters."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
@@ -231,7 +231,6 @@ def result_page(found: object, message: str, problem: Any, start: Values, best: 
 
 
 def _draw_ends(problem: Problem, points: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the last states (or pictures) of the runs from ``points``, and a known target."""
     # the user's problem keeps its last evaluation
     own = Problem(problem.simulation, problem.steps, problem.loss, state=problem.state)
     step, loss = max(own.loss.losses.items()) if isinstance(own.loss, Frames) else (own.steps, own.loss)
@@ -259,7 +258,7 @@ def as_words(found: object) -> str:
 
 
 def picture(found: object, draw: Callable[[Path], Any]) -> str:
-    """Return HTML of the PNG that ``draw`` writes to a path; empty if a package for drawing is missing."""
+    """Return HTML of the PNG that ``draw`` writes to a path, or an empty text if a drawing package is missing."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         try:

@@ -1,4 +1,4 @@
-"""Painters of scenes in 2-D and 3-D; texts, lines and colour scales on pictures; and the picture of a scene before a
+"""Painters of scenes in 2-D and 3-D, texts and lines on pictures, colour scales, and the picture of a scene before a
 run."""
 
 from collections.abc import Iterable, Sequence
@@ -29,46 +29,43 @@ FINER = 3
 Text = tuple[tuple[int, int], str, str]
 """A text on a picture: its place (column, row), the text, and Pillow's two-letter anchor."""
 SMALL, SMALLEST = 11, 7
-"""Letter size in pixels on a small picture, and least size for a text that is too long."""
+"""Letter size on a small picture, and least letter size [pixels]."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 PALETTE = "viridis"
 OUTERMOST = (0.5, 99.5)
-"""Percentiles at the ends of the scale, so that a few extreme particles do not darken all others."""
+"""Percentiles of the values at the ends of the colour scale."""
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
 MOVING = np.array([0.75, 0.20, 0.02])
 POSES = 60
-"""Approximate number of positions shown along a path; at most twice this number is shown."""
 ARROW = 0.18
-"""Length of an arrow relative to the size of the contents."""
 HEAD = 0.22
-"""Length of an arrow's head relative to the arrow."""
 
 
 def painter(
     scene: Scene, positions: Points | Sequence[Points], device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
-    """Return the painter of a scene; arguments are as in `stage_of`, and ``device`` traces the rays."""
+    """Return the painter of a scene. The arguments are as in `stage_of`, and rays are traced on ``device``."""
     stage = stage_of(scene, positions, poses)
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the stage of a scene for fluid at positions (n, d) or (frames, n, d) [m]; the picture includes solids at
-    later ``poses``."""
+    """Return the stage of a scene for fluid at positions (n, d) or (frames, n, d) [m]. The stage also contains the
+    solids at later ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Return the linear colour (n, 3) of each particle by its phases, in the scene's colours or in ``colours`` (phases,
-    3)."""
+    """Return the linear colour of each particle (n, 3), mixed from the colours of its phases. ``colours`` (phases, 3)
+    replace the colours of the scene."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
 
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
-    """Draw a linear picture (rows, columns, 3) of a scene before it is run, with paths, arrows and sizes, and with
-    particles at positions (n, d) [m] as spheres of linear colours (n, 3)."""
+    """Draw a linear picture (rows, columns, 3) of a scene before a run, with paths, arrows and sizes. Particles are
+    spheres at ``positions`` (n, d) [m] with linear colours (n, 3)."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene = scene.model_copy(update={"picture": look})
     spacing, paths = scene.discretisation.spacing, _paths(scene)
@@ -90,13 +87,12 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
 
 
 def _paths(scene: Scene) -> list[Points]:
-    """Return the paths (k, d) [m] of the middles of solids and of emitters' openings."""
     found = [places for table in scene.solid if (places := _places(table)) is not None]
     return found + [emitter.path.knots.seen for emitter in scene.emitter if emitter.path is not None]
 
 
 def _places(table: SolidTable) -> Points | None:
-    """Return the positions (k, d) [m] of a solid's middle along its path; None without a path."""
+    """Return the positions of a solid's middle along its path (k, d) [m], or None without a path."""
     shifts = courses(table)[0] if table.motion == "path" else None
     return table.middle() + shifts.seen if isinstance(shifts, Knots) else None
 
@@ -113,7 +109,6 @@ def _poses(scene: Scene) -> list[Scene]:
 
 
 def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
-    """Return an arrow (5, d) [m], one stroke for shaft and head, out of an emitter's opening."""
     start, direction = np.array(emitter.outlet), np.array(emitter.direction)
     size = np.ptp(scene.container.extent() or positions, axis=0).max()
     length = max(ARROW * float(size), emitter.width)
@@ -125,7 +120,6 @@ def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
 
 
 def _edges(stage: Any, lower: Points, upper: Points) -> list[Points]:
-    """Return for each axis the ends (2, 2) on the screen of the box's edge that is outermost on the screen."""
     box, found = corners(lower, upper), list[Points]()
     for axis in range(len(lower)):
         pairs = [np.array([a, b]) for a in box for b in box if a[axis] < b[axis] and np.delete(a == b, axis).all()]
@@ -147,8 +141,8 @@ def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> lis
 
 
 def labelled(image: Points, text: str, below: str = "") -> Points:
-    """Write ``text`` at the upper left of a linear picture (rows, columns, 3) and ``below`` at the lower left, in
-    place."""
+    """Write ``text`` at the upper left of a linear picture (rows, columns, 3) and ``below`` at the lower left. The
+    picture is changed in place."""
     rows, columns = image.shape[:2]
     size = max(round(0.042 * rows), SMALL)
     left, top = round(0.9 * size), round(0.7 * size)
@@ -157,20 +151,21 @@ def labelled(image: Points, text: str, below: str = "") -> Points:
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:
-    """Write texts on a linear picture (rows, columns, 3), in place, with letters of ``size`` pixels."""
+    """Write texts on a linear picture (rows, columns, 3), with letters of ``size`` pixels. The picture is changed in
+    place."""
     where, cover = _covered(image.shape[:2], tuple(texts), size)
     image[where] = image[where] * (1.0 - cover) + INK * cover
     return image
 
 
 def length_of(text: str, size: int) -> float:
-    """Return the width of a text in pixels, for letters of ``size`` pixels."""
+    """Return the width of a text in pixels, with letters of ``size`` pixels."""
     return float(_font(size).getlength(text))
 
 
 @lru_cache(maxsize=32)
 def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
-    """Return the part of a picture that contains texts, and the fraction of each pixel there that letters cover."""
+    """Return the part of a picture that contains texts, and the opacity of each pixel of this part."""
     from PIL import Image, ImageDraw
 
     mask = Image.new("L", shape[::-1])
@@ -182,8 +177,8 @@ def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tupl
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
-    """Draw lines of a linear colour (3,) on a linear picture (rows, columns, 3), through points (k, 2) given as column
-    and row; ``width`` is in pixels."""
+    """Draw lines through points (k, 2), given as column and row, on a linear picture (rows, columns, 3). ``colour``
+    (3,) is linear, and ``width`` is in pixels."""
     from PIL import Image, ImageDraw
 
     rows, columns = image.shape[:2]
@@ -196,8 +191,7 @@ def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) ->
 
 
 def side_by_side(images: Sequence[Points], across: int, names: Sequence[str] = ()) -> Points:
-    """Arrange pictures of one size in rows of ``across``, separated by thin light lines, and label each with its name,
-    if any."""
+    """Arrange pictures of one size in rows of ``across`` pictures, with thin lines between them, and label them."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
     page = np.ones((down * rows, across * columns, 3), images[0].dtype)
@@ -229,8 +223,8 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """Make the scale for values, such as those of all frames of a film; ``unit`` is needed for quantities that
-        exist only in some scenes."""
+        """Make the scale for ``values``, such as the values of all frames of a film. Give the ``unit`` of a quantity
+        that exists only in some scenes."""
         least, greatest = np.percentile(values, OUTERMOST)
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
@@ -238,7 +232,7 @@ class Scale:
         return _colours(np.clip((values - self.least) / (self.greatest - self.least or 1.0), 0.0, 1.0))
 
     def columns(self, rows: int) -> int:
-        """Return the width of the scale in pixels, on a picture with ``rows`` rows."""
+        """Return the width of the scale in pixels for a picture with ``rows`` rows."""
         size = _size_of_letters(rows)
         return ceil(max(self._wide(size), *(length_of(text, size) for text in self._heads))) + size
 
@@ -249,8 +243,8 @@ class Scale:
         return self.on(np.concatenate([image, np.repeat(smooth[:, None], self.columns(rows), axis=1)], axis=1))
 
     def on(self, image: Points) -> Points:
-        """Return the picture (rows, columns, 3) with the scale over its right edge, the greatest value on top, below
-        name and unit."""
+        """Return a picture (rows, columns, 3) with the scale drawn over its right edge. The greatest value is at the
+        top."""
         rows, columns = image.shape[:2]
         size = _size_of_letters(rows)
         top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2
@@ -291,7 +285,6 @@ def _size_of_letters(rows: int) -> int:
 
 @cache
 def _palette() -> Points:
-    """Return (256, 3), linear."""
     from matplotlib import colormaps
 
     palette = colormaps[PALETTE]

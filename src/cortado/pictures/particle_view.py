@@ -1,4 +1,4 @@
-"""Animation of particles as a part of an HTML page; it plays from a file, without server or network."""
+"""An animation of particles as a part of an HTML page. It plays from a file, without a server or a network."""
 
 from __future__ import annotations
 
@@ -22,43 +22,41 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, CylinderContainer
 
 MOST_BYTES = 2_200_000
-"""Greatest size [bytes] of positions, speeds and colours in one view, before base64 makes them a third larger."""
+"""Greatest size of the data of an animation before base64 encoding [bytes]."""
 LEAST_FRAMES, MOST_FRAMES = 24, 120
-"""Least and greatest number of frames; if many particles leave room for fewer frames, some particles are left out."""
+"""Least and greatest number of frames."""
 SHORTEST, LONGEST = 3.0, 12.0
-"""Playing time [s]."""
+"""Least and greatest playing time [s]."""
 LARGEST = 32767
-"""Largest 16-bit position."""
 _PLAIN = (0.1, 0.3, 0.8)
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The particles of a run over frames."""
+    """The particles of a run in all frames of an animation."""
 
     name: str
     positions: NDArray[Any]
-    """(frames, n, d) [m]"""
+    """Positions (frames, n, d) [m]."""
     speeds: NDArray[Any]
-    """(frames, n) [m/s]"""
+    """Speeds (frames, n) [m/s]."""
     colours: NDArray[Any] | None = None
-    """(n, 3) or (frames, n, 3), linear, from 0 to 1"""
+    """Linear colours from 0 to 1, (n, 3) or (frames, n, 3)."""
 
 
 def style() -> str:
-    """Return the CSS of all views, which a page with views must contain."""
+    """Return the CSS of all animations of a page."""
     return Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 
 def script() -> str:
-    """Return the script that animates all views of a page; it must appear once in the page, after the views."""
+    """Return the script that runs all animations of a page. It must appear once, after the animations."""
     source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
     return f"<script>\n{source}</script>"
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
-    """Choose the frames to show, and the stride with which particles are selected, for a view of at most
-    ``most_bytes``.
+    """Choose frames and a stride of particles, so that an animation needs at most ``most_bytes``.
 
     Args:
         numbers: bytes per particle and frame, summed over all clouds: two for each component of the position, one for
@@ -72,13 +70,13 @@ def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BY
 def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
-    """Return HTML that shows the clouds side by side, rotated together; y is up.
+    """Return HTML that shows clouds of particles side by side with the y axis up. All clouds are rotated together.
 
     Args:
         clouds: clouds with the same frames and the same number of particles.
         times: (frames,) [s].
         spacing: distance between particles at rest [m].
-        lines: (k, 2, d) ends of lines [m], such as the edges of a container.
+        lines: (k, 2, d) end points of lines [m], such as the edges of a container.
         stride: the clouds contain every ``stride``-th particle (`thinned`).
     """
     times, (_, particles, dimension) = np.asarray(times, dtype=float), clouds[0].positions.shape
@@ -139,7 +137,6 @@ def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride:
 
 
 def _space(vectors: NDArray[Any]) -> NDArray[Any]:
-    """Return vectors (..., d) as (..., 3), rounded to six digits."""
     padded = in_space(vectors)
     return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
 
@@ -152,8 +149,8 @@ ROUND = 48
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
-    """Return HTML that shows runs of a scene side by side; ``runs`` has by name a state, such as a `Frame`, for each of
-    the times (frames,) [s]."""
+    """Return HTML that shows runs of a scene side by side. ``runs`` maps a name to the states at ``times`` (frames,)
+    [s]."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
@@ -166,12 +163,12 @@ def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike
 
 
 def outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the outlines of a scene's container and solids."""
+    """Return the outlines of the container and the solids of a scene as line segments (k, 2, d) [m]."""
     return np.concatenate([container_outline(scene), solid_outline(scene)])
 
 
 def container_outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the outline of a scene's container; k is 0 without a container."""
+    """Return the outline of the container of a scene as line segments (k, 2, d) [m]. Without a container, k is 0."""
     container, ends = scene.container, scene.container.extent()
     if ends is None:
         return np.zeros((0, 2, scene.dimension))

@@ -1,4 +1,4 @@
-"""Pictures of 2-D fluid on paper, drawn as a body with a smooth edge and a little gloss."""
+"""Pictures of 2-D fluid on paper, with smooth edges and a little gloss."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,16 +18,16 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import BoxContainer
 
 LIGHT = (-0.45, 0.70, 0.55)
-"""Direction of the lamp: to the right, up, towards the viewer."""
+"""Direction to the lamp: right, up, and towards the viewer."""
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """Shade a body so that it looks thicker in the middle than at its edge; return colours (rows, columns, 3).
+    """Shade a shape so that it looks thicker in the middle than at its edge, and return colours (rows, columns, 3).
 
     Args:
-        cover: (rows, columns).
-        colour: (rows, columns, 3) or (3,), linear.
-        width: of the edge, in pixels.
+        cover: fraction of each pixel that the shape covers (rows, columns).
+        colour: linear colours (rows, columns, 3) or (3,).
+        width: width of the edge in pixels.
         gleaming: brightness of the lamp's reflection.
     """
     from scipy.ndimage import gaussian_filter
@@ -51,31 +51,30 @@ FILLED = 0.80
 """Fraction of the picture's width or height that the contents fill."""
 GLASS = (0.40, 0.50, 0.55)
 GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
-"""Brightness of the lamp's reflection in dull solids, and in mirrors."""
+"""Brightness of the lamp's reflection in dull solids and in mirrors."""
 SOLID_SHADOW = 0.25
-"""Fraction by which the paper is darker behind a solid."""
+"""Darkening of the paper in the shadow of a solid."""
 BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
-"""Shadows, relative to the size of the contents: softness, downward offset, and distance from a body beyond which there
-is no shadow."""
+"""Softness, downward offset and greatest distance of shadows, relative to the size of the contents."""
 Layer = tuple[Points, Points]
-"""Opacity (rows, columns, 1) and colours (rows, columns, 3)."""
+"""Opacity (rows, columns, 1) and colours (rows, columns, 3) of a layer."""
 
 
 @dataclass(frozen=True)
 class PlaneStage:
-    """The surroundings of 2-D fluid, on the pixels of a picture; parts at rest are drawn once."""
+    """The surroundings of 2-D fluid on the pixels of a picture."""
 
     picture: Picture
     container: BoxContainer | None
     lower: Points
-    """(2,) lower ends of the contents [m]"""
+    """Lower corner of the contents (2,) [m]."""
     upper: Points
-    """(2,) [m]"""
+    """Upper corner of the contents (2,) [m]."""
     spacing: float
-    """[m]"""
+    """Particle spacing [m]."""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
-    """Lower and upper ends (2,) [m] of the region in the picture's middle; by default those of the contents."""
+    """Lower and upper corner (2,) [m] of the shown region, by default of the contents."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
@@ -104,31 +103,30 @@ class PlaneStage:
 
     @cached_property
     def pixel(self) -> float:
-        """Width [m]."""
+        """Width of a pixel [m]."""
         size = np.array([self.picture.width, self.picture.height])
         return float((self.seen_size / (FILLED * size)).max())
 
     @property
     def _middle(self) -> Points:
-        """(2,) [m]"""
         lower, upper = self.seen or self.ends
         return 0.5 * (lower + upper)
 
     @cached_property
     def pixels(self) -> tuple[Points, Points]:
-        """x and y (rows, columns) of the middle of each pixel [m]."""
+        """Coordinates x and y of the middle of each pixel (rows, columns) [m]."""
         columns, rows, middle = self.picture.width, self.picture.height, self._middle
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
     def is_near(self, points: Points, margin: float) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the points (n, 2) [m] that are in the picture or within a ``margin`` [m] of it."""
+        """Return a mask (n,) of the points (n, 2) [m] that are at most ``margin`` [m] outside the picture."""
         half = 0.5 * self.pixel * np.array([self.picture.width, self.picture.height])
         return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
 
     def on_screen(self, points: Points) -> Points:
-        """Return column and row (n, 2) in the picture of points (n, 2) [m]."""
+        """Return the column and row in the picture (n, 2) of points (n, 2) [m]."""
         off = (points - self._middle) / self.pixel
         return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
 
@@ -136,12 +134,12 @@ class PlaneStage:
 
     @property
     def gloss_width(self) -> float:
-        """Width in pixels."""
+        """Width of the glossy edge in pixels."""
         return max(0.55 * self.spacing / self.pixel, 1.5)
 
     @cached_property
     def behind(self) -> Points:
-        """Draw the background (rows, columns, 3) of the fluid: paper with shadows, and the inside of a container."""
+        """Draw the background of the fluid (rows, columns, 3): paper with shadows, and the inside of the container."""
         (x, y), middle, half = self.pixels, self._middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
         paper = np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
@@ -162,7 +160,7 @@ class PlaneStage:
 
     @cached_property
     def free(self) -> Points:
-        """Fraction (rows, columns) of each pixel that is inside the container and outside all solids."""
+        """Fraction of each pixel (rows, columns) that is inside the container and outside all solids."""
         free = self._room
         for _, distance in self._bodies:
             free = free * (1.0 - self._covered(distance))
@@ -170,22 +168,20 @@ class PlaneStage:
 
     @cached_property
     def shown(self) -> Points:
-        """Fraction (rows, columns) of each pixel where fluid is drawn; opaque solids are drawn over the fluid later."""
+        """Fraction of each pixel (rows, columns) where fluid is drawn. Opaque solids are later drawn over the fluid."""
         return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property
     def _bodies(self) -> list[tuple[ShownSolid, Points]]:
-        """Solids around which fluid flows, each with the distance of pixels from it."""
         return [(one, self._distance(one)) for one in self.solids if not one.is_tank]
 
     @cached_property
     def _tanks(self) -> list[tuple[ShownSolid, Points]]:
-        """Solids that contain fluid, each with the distance of pixels from its cavity."""
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
-        """Return the signed distance (rows, columns) [m] from a body, measured ``drop`` [m] above each pixel; negative
-        inside, infinite far away."""
+        """Return the signed distance from a solid (rows, columns) [m], measured ``drop`` [m] above each pixel. It is
+        negative inside the solid."""
         (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
         columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
         rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
@@ -199,7 +195,7 @@ class PlaneStage:
 
     @cached_property
     def _room(self) -> Points:
-        """Fraction (rows, columns) of each pixel that is inside the container and the tanks."""
+        """Fraction of each pixel (rows, columns) that is inside the container and the tanks."""
         room = np.ones(self.pixels[0].shape)
         if self.container is not None:
             x, y = self.pixels
@@ -211,11 +207,10 @@ class PlaneStage:
 
     @property
     def _size(self) -> float:
-        """[m]"""
         return float((self.upper - self.lower).max())
 
     def _shadow(self) -> Points:
-        """Return the darkening (rows, columns) of the paper behind the container and tanks."""
+        """Return the darkening of the paper behind the container and tanks (rows, columns)."""
         tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
         if self.container is None:
             return np.max(tanks, axis=0)
@@ -229,7 +224,7 @@ class PlaneStage:
         return np.max([0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop), *tanks], axis=0)
 
     def _below(self, shown: ShownSolid) -> Points:
-        """Return the fraction (rows, columns) of light that a body's shadow takes from the paper."""
+        """Return the darkening of the paper by the shadow of a solid (rows, columns)."""
         distance = self._distance(shown, DROPPED * self._size)
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
 
@@ -254,8 +249,7 @@ class PlaneStage:
         return self._walls(distance, part, np.array(GLASS if container.finish is None else container.finish.colour))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
-        """Return the layer of walls, given the distance [m] of pixels from the inner side and the fraction ``part``
-        with a wall."""
+        """Return the layer of walls. ``distance`` is the distance of the pixels from the inner side [m]."""
         wall = 0.01 * self._size
         band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
         shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
@@ -264,13 +258,13 @@ class PlaneStage:
 
 
 SUPPORT = 1.3
-"""Support of a particle's field, in spacings."""
+"""Support radius of a particle's field [spacings]."""
 DROP = 0.8
-"""Strength of the field of an isolated particle, which makes a drop about as large as a spacing."""
+"""Strength of the field of an isolated particle."""
 GRID = 4
 """Number of field nodes per spacing along an axis."""
 TOUCHING = 0.9
-"""Distance in spacings below which fluid counts as touching a wall."""
+"""Distance from a wall below which fluid touches the wall [spacings]."""
 
 
 @dataclass(frozen=True)
@@ -293,8 +287,7 @@ class PlanePainter:
         return np.clip(image, 0.0, 1.0)
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
-        """Return the fraction (rows, columns) of each pixel that fluid covers, and the fluid's colour (rows, columns,
-        3)."""
+        """Return the opacity of the fluid (rows, columns), and its colours (rows, columns, 3)."""
         from scipy.ndimage import map_coordinates
         from scipy.spatial import cKDTree
 
@@ -324,8 +317,8 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Return positions (n, 2) with mirror images behind touched walls and with periodic images, and each position's
-        particle number."""
+        """Return positions (n, 2) of particles and of their mirror images and periodic images. Also return the particle
+        number of each position."""
         stage, of, reach = self.stage, np.arange(len(positions)), TOUCHING * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)
@@ -342,7 +335,7 @@ class PlanePainter:
 
 
 def _weight(distances: Points, reach: float) -> Points:
-    """Return Wendland's C2 function of distances / reach, 1 at distance 0."""
+    """Return Wendland's C2 function of distances / reach, which is 1 at distance 0."""
     q = np.minimum(distances / reach, 1.0)
     return (1.0 - q) ** 4 * (1.0 + 4.0 * q)
 
@@ -350,8 +343,8 @@ def _weight(distances: Points, reach: float) -> Points:
 def _splat(
     positions: Points, strength: Points, colours: Points, corner: Points, cell: float, counts: np.ndarray, reach: float
 ) -> tuple[Points, Points]:
-    """Return at nodes (nx, ny) the sum of the particles' fields, and their mean colour (3, nx, ny) with weights that
-    fall with distance."""
+    """Return the sum of the particles' fields at nodes (nx, ny), and the mean colour of nearby particles (3,
+    nx, ny)."""
     patch = np.arange(-int(reach / cell) - 1, int(reach / cell) + 2)
     nearest = np.rint((positions - corner) / cell).astype(int)
     size = int(np.prod(counts))

@@ -1,4 +1,4 @@
-"""Plots with matplotlib in a common style; each PNG is written completely or not at all."""
+"""Plots with matplotlib in a common style."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cortado.files.disk import write_atomically
 from cortado.files.image_encoding import srgb_bytes, to_srgb
 
 PALETTE = ("#3d6b8e", "#c0763b", "#5b8a5a", "#8c5f7d", "#a89a4b", "#6b7a80", "#a8504f", "#4f8f8b")
-"""Muted colours that remain distinguishable in print and for most colour-blind readers."""
+"""Muted colours that most colour-blind readers can distinguish."""
 INK, FAINT = "#2b2a28", "#8a857c"
 DASHED: dict[str, Any] = {"linestyle": (0, (5, 4)), "linewidth": 1.2}
 STYLE: dict[str, Any] = {
@@ -32,7 +32,7 @@ STYLE: dict[str, Any] = {
 
 @contextmanager
 def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
-    """Yield a figure of a width and height in inches; it is saved under `path` if the block ends without an error."""
+    """Yield a figure with a width and height in inches. It is saved at `path` if the block ends without an error."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -89,7 +89,7 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot each component of ``found`` (k, c) in a separate panel over ``x`` (k,). ``true`` and ``start`` are (c,) or
+    """Plot each component of ``found`` (k, c) over ``x`` (k,) in a separate panel. ``true`` and ``start`` are (c,) or
     (k, c)."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
@@ -115,7 +115,7 @@ _MOST_IN_A_ROW = 4
 
 
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path) -> Path:
-    """Plot linear images (rows, columns, 3) in a row, such as start, target and result, or more than 4 in a grid."""
+    """Plot linear images (rows, columns, 3) in a row. More than four images form a grid."""
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
         raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
@@ -137,7 +137,7 @@ def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path)
 _FAR, _NEAR = "#c9d9e4", "#27506f"
 _MOST_DRAWN = 150_000
 _SHOWN_RANGE = (0.0, 99.5)
-"""Percentiles at the ends of a colour scale, so that a few fast drops do not darken all others."""
+"""Percentiles of the values at the ends of a colour scale."""
 
 
 def particles(
@@ -153,17 +153,17 @@ def particles(
 ) -> Path:
     """Plot particle sets side by side, such as before, after and target.
 
-    In 3-D the view is along the third axis: x to the right, y upwards, larger z nearer; nearer particles cover farther
-    ones. Above 150 000 particles, only every k-th is drawn.
+    In 3-D the view is along the z axis, with x to the right and y upwards. Particles with larger z are nearer and cover
+    farther particles. Above 150 000 particles, only every k-th particle is drawn.
 
     Args:
-        positions: one (n, d) [m] for each panel.
-        colours: for each panel (n,) numbers, drawn with one scale (speed, density), or (n, 3) linear colours from 0 to
-            1; None shades by depth.
+        positions: one array (n, d) [m] for each panel.
+        colours: for each panel (n,) numbers, which share one colour scale, or (n, 3) linear colours from 0 to 1. None
+            shades particles by depth.
         colour_label: label of the colour scale, with its unit.
-        container: lower and upper corner (d,) [m], outlined.
-        lines: for each panel (k, 2, d) ends of lines [m], drawn over the particles, such as outlines of solids.
-        dimension: 2 or 3, by default the dimension of the first set; in 2-D a third component is ignored.
+        container: lower and upper corner (d,) [m] of the container, whose outline is drawn.
+        lines: for each panel (k, 2, d) end points of lines [m], drawn over the particles, such as outlines of solids.
+        dimension: 2 or 3, by default the dimension of the first set. In 2-D a third component is ignored.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -196,7 +196,6 @@ def particles(
 
 
 def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -> tuple[Points, Points]:
-    """Return lower and upper corner (2,) [m] of the particles and the container, with a margin."""
     corners = [points[np.isfinite(points).all(axis=1), :2] for points in sets]
     if container is not None:
         corners.append(np.asarray(container, dtype=float)[:, :2])
@@ -209,7 +208,7 @@ def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -
 
 
 class _ColourScale:
-    """A map from the caller's ``colours`` to red, green and blue, with one scale for all panels."""
+    """A map from numbers or colours of particles to red, green and blue, shared by all panels."""
 
     def __init__(self, sets: list[NDArray[Any]], colours: Sequence[NDArray[Any] | None]) -> None:
         from matplotlib.cm import ScalarMappable
@@ -227,14 +226,13 @@ class _ColourScale:
         self.mappable = self._map if numbers else None
 
     def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
-        """Return colours (n, 3) from 0 to 1 of points, from ``colours`` or, if None, from the points' depth."""
+        """Return the colours of points (n, 3) from 0 to 1. If ``colours`` is None, points are shaded by depth."""
         if colours is not None and colours.ndim == 2:
             return srgb_bytes(colours) / 255.0
         return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
 
 
 def _depth(points: NDArray[Any]) -> NDArray[Any]:
-    """Return (n,) [m]."""
     return points[:, 2] if points.shape[1] == 3 else np.zeros(len(points))
 
 
@@ -256,8 +254,7 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
 
 
 def spacing_of(points: NDArray[Any], otherwise: float = 0.02) -> float:
-    """Return the median distance to the nearest neighbour [m], of at most a thousand particles; ``otherwise`` for a
-    single particle."""
+    """Return the median distance to the nearest neighbour [m], or ``otherwise`` for a single particle."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:

@@ -42,8 +42,8 @@ SHEET = 3
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Draw a run's first and last state, a contact sheet and a film into a folder; return (caption, path) of each.
-    Sheet and film have quality "quick" unless the scene sets the quality."""
+    """Draw the first and the last state of a run, a contact sheet and a film into a folder. Return captions and paths.
+    Contact sheet and film have the quality "quick" unless the scene sets the quality."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -78,8 +78,7 @@ def run_page(run: ShownRun, device: Any) -> Page:
 
 
 def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | Stage, Callable[[Points], Points]]:
-    """Return the stage and the method that draws the colour scale: over the picture's right edge, or beside a narrower
-    picture if the scale would cover contents."""
+    """Return a stage with space for a colour scale, and the function that draws the scale."""
     free = stage.picture.width - scale.columns(stage.picture.height)
     is_covered = stage.on_screen(corners(*stage.ends))[:, 0].max() > free
     if not is_covered or free < LEAST_PIXELS:
@@ -90,14 +89,14 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 Units = Mapping[str, str]
 Settings = Mapping[str, Any]
 Given = Scene | str | Path | None
-"""A scene, the path of its file, or None for that of the trajectory."""
+"""A scene, the path of its file, or None for the scene of the trajectory."""
 
 
 def shown_run(
     trajectory: Trajectory, scene: Scene, settings: Settings, units: Units | None = None, simulation: Computed = None
 ) -> ShownRun:
-    """Return a run prepared for pictures, with keys of [picture] replaced; ``simulation`` computes unrecorded
-    colours."""
+    """Return a run prepared for pictures, with keys of [picture] replaced. ``simulation`` computes colours that were
+    not recorded."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units
@@ -146,7 +145,7 @@ def trajectory_film(trajectory: Trajectory, path: str | Path, scene: Given, devi
 
 
 def device_of(name: str) -> Any:
-    """Return the Warp device with this name; raise `InputError` for an unknown name."""
+    """Return the Warp device with this name, or raise `InputError`."""
     start_warp()
     return device_named(name)
 
@@ -178,12 +177,12 @@ def _alone(frame: Frame) -> Trajectory:
 
 
 WIDE = 16.0 / 9.0
-"""Ratio of columns to rows for pictures of which a user sets only the number of lines."""
+"""Aspect ratio of pictures if the user sets only the number of lines."""
 
 
 def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> Scene:
-    """Return the scene with keys of [picture] replaced; ``colour`` may also name one of ``fields``. Raise `SceneError`
-    for settings that do not fit."""
+    """Return the scene with keys of [picture] replaced by ``settings``. ``colour`` may also name one of ``fields``.
+    Raises `SceneError` for invalid settings."""
     given = {} if scene.picture is None else scene.picture.model_dump()
     wanted = {**given, **settings}
     if "lines" in settings:
@@ -205,8 +204,8 @@ def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot the density error [%] and the iterations of each solver loop over the steps; steps that did not converge are
-    marked."""
+    """Plot the density error [%] and the iterations of each solver loop over time steps. Steps that did not converge
+    are marked."""
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
@@ -235,7 +234,7 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
-    """Plot a curve for each number of each sensor; numbers with the same unit share a panel."""
+    """Plot a curve for each number of each sensor, with one panel for each unit."""
     lines = dict[str, list[tuple[str, Readings, str]]]()
     for name, own in found.items():
         for column, unit in own.units.items():
@@ -249,7 +248,7 @@ def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
 
 @contextmanager
 def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
-    """Yield panels of a plot over time, stacked vertically, one for each unit; each panel gets a legend."""
+    """Yield vertically stacked panels of a plot over time, one for each unit."""
     with drawing(path, height=1.5 + 2.5 * len(units)) as figure:
         panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
         yield panels
@@ -260,7 +259,7 @@ def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
-    """Plot a panel for each measured number: measured points, the sensor's curve, and the error in the title."""
+    """Plot a panel for each measured number, with the measured points, the curve of the sensor, and the error."""
     with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")
@@ -277,7 +276,7 @@ if TYPE_CHECKING:
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
-    """Plot central differences against forward mode, growth of the adjoint, the shortest horizon, and estimators."""
+    """Plot the results of a gradient check: central differences, growth of the adjoint, horizon, and estimators."""
     with drawing(path, 12.0, 8.4) as figure:
         (differences, growth), (horizon, estimators) = figure.subplots(2, 2)
         _differences(differences, certificate)

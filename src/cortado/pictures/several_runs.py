@@ -49,20 +49,20 @@ def film_side_by_side(
 ) -> Film:
     """Write a film of up to nine runs side by side, an mp4 or webp as in `Trajectory.film`, and return it.
 
-    All runs share clock, camera, colour scale and the first scene's table [picture]. At each time of the film, a run's
-    recorded frame nearest in time is shown; a run that has ended shows its last frame.
+    All runs share the clock, the camera, the colour scale and the table [picture] of the first scene. At each time of
+    the film, the recorded frame nearest in time is shown. A run that has ended shows its last frame.
 
     Args:
-        runs: trajectories by label; in a list without labels, labels are made of the values in which the scenes differ.
-        path: ends in .mp4 or in .webp.
-        scenes: the runs' scenes or the paths of their files; needed for trajectories loaded from files.
+        runs: trajectories by label. In a list without labels, labels are made of the values in which the scenes differ.
+        path: path that ends in .mp4 or in .webp.
+        scenes: the scenes of the runs or the paths of their files, needed for trajectories loaded from files.
         device: device that traces the rays, "cpu" or "cuda:0".
-        settings: as in `Trajectory.film`; ``lines``, ``width`` and ``height`` are those of the whole film.
+        settings: as in `Trajectory.film`. ``lines``, ``width`` and ``height`` are the size of the whole film.
 
     Raises:
-        SceneError: settings that do not fit.
-        InputError: no runs or more than nine, 2-D and 3-D runs mixed, a run without frames or scene, a missing package,
-        or a ``colour`` that was not recorded and cannot be computed.
+        SceneError: settings are invalid.
+        InputError: there are no runs or more than nine, 2-D and 3-D runs are mixed, a run has no frames or no scene, a
+            package is missing, or a ``colour`` was not recorded and cannot be computed.
 
     Example: ``cortado.film_side_by_side({"thin": first, "thick": second}, "both.mp4")``
     """
@@ -86,7 +86,6 @@ def film_side_by_side(
 
 
 def _trajectories(runs: Any) -> list[Trajectory]:
-    """Return trajectories from a mapping or an iterable; raise `InputError` for other objects."""
     each = runs.values() if isinstance(runs, Mapping) else runs
     if not isinstance(each, Iterable) or isinstance(runs, Trajectory):
         raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
@@ -98,8 +97,8 @@ def _trajectories(runs: Any) -> list[Trajectory]:
 
 
 def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
-    """Return the runs' scenes with the first scene's table [picture], after `shown_as`; raise `InputError` for unlike
-    runs."""
+    """Return the scenes of runs with the table [picture] of the first scene. Raises `InputError` for runs that cannot
+    be shown together."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -115,8 +114,8 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Return a page of runs whose scenes are `shown_alike`, each labelled with name and time, and its frames' times
-    [s]."""
+    """Return a page of runs and the times of its frames [s]. Each run is labelled with its name and time. Prepare the
+    scenes by `shown_alike`."""
     times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -153,8 +152,8 @@ SAME = 0.01
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] of a film of several runs: those of the run with the highest frame rate, extended
-    at both ends by those of other runs."""
+    """Return the times (frames,) [s] of a film of several runs. The run with the highest frame rate determines the
+    interval."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -167,18 +166,18 @@ def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def interval_of(times: NDArray[Any]) -> float:
-    """Return the typical time between two frames [s]; infinite for a single frame."""
+    """Return the typical time between two frames [s], or infinity for a single frame."""
     return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class ShownFrames:
-    """The frames of one run that a film shows: the nearest recorded frame for each time of the film."""
+    """The recorded frames of one run that are nearest to the times of a film."""
 
     own: NDArray[Any]
-    """(own frames,) recording times [s]"""
+    """Times of the recorded frames [s]."""
     times: NDArray[Any]
-    """(frames,) [s]"""
+    """Times of the film (frames,) [s]."""
 
     @cached_property
     def nearest(self) -> NDArray[np.int64]:
@@ -186,17 +185,17 @@ class ShownFrames:
 
     @cached_property
     def during(self) -> NDArray[np.bool_]:
-        """Mask (frames,) of the times between the start and the end of the run."""
+        """Mask (frames,) of the times of the film at which the run is running."""
         near = SAME * interval_of(self.times)
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
     @property
     def off(self) -> float:
-        """Greatest difference [s] between a shown frame's time and the film's time, while the run lasts."""
+        """Greatest difference between the times of the film and the times of the shown frames [s]."""
         return float(np.abs(self.own[self.nearest] - self.times)[self.during].max(initial=0.0))
 
     def time_in_words(self, k: int) -> str:
-        """Describe the recording time of the frame shown as frame k, with enough digits to distinguish frames."""
+        """Describe the recording time of frame k."""
         interval = interval_of(self.times)
         digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
         time = f"{self.own[self.nearest[k]]:.{digits}f} s"
@@ -209,12 +208,12 @@ class ShownFrames:
 
 
 MOST_KEYS, LONGEST = 3, 64
-"""Greatest numbers of values and of characters of a label; beyond these a different label is used."""
+"""Greatest number of values in a label, and greatest length of a label in characters."""
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """Return a label for each scene: its name if all names differ, else the values in which the scenes differ, such as
-    ``viscosity = 0.1 Pa s``. Return ``otherwise`` if no values or too many differ."""
+    """Return a label for each scene. It is the scene's name if all names differ, or else the values in which the scenes
+    differ, such as ``viscosity = 0.1 Pa s``. Return ``otherwise`` if no values or too many values differ."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]

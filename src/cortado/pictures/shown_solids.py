@@ -1,4 +1,4 @@
-"""The solids of a scene for pictures: shapes with pose and colour, edges as lines, and triangle meshes."""
+"""The solids of a scene for pictures: shapes with poses and colours, outlines, and triangle meshes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,13 +15,14 @@ from cortado.scene.scene import Scene
 
 Numbers = NDArray[np.int64]
 SAME = 1e-9
-"""Distance below which two vertices are merged, relative to the size of the mesh."""
+"""Distance for merging two vertices, relative to the size of the mesh."""
 SHARP = 0.8
-"""Cosine of the angle between the normals of two triangles below which the edge between them is sharp."""
+"""Cosine of the angle between two normals above which an edge is smooth."""
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """Merge coincident vertices; return vertices, the triangles that keep an area, and a mask of these triangles."""
+    """Merge coincident vertices. Return the vertices, the triangles that still have an area, and a mask of the
+    remaining triangles."""
     whole = np.rint((vertices - vertices.min(axis=0)) / (SAME * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
@@ -30,7 +31,7 @@ def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray
 
 
 def sides_of(corners: Numbers) -> Numbers:
-    """Return the sides (3 t, 2) of triangles (t, 3): for each corner in turn the opposite side."""
+    """Return the sides of triangles (t, 3) as pairs of vertices (3 t, 2)."""
     return corners[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
 
 
@@ -39,19 +40,19 @@ def lengths_of(vertices: Points, sides: Numbers) -> Points:
 
 
 def across_of(vertices: Points, corners: Numbers) -> Points:
-    """Return outward normals (t, 3) of triangles, with length twice the triangle's area [m2]."""
+    """Return the outward normals of triangles (t, 3). The length of a normal is twice the area of the triangle [m2]."""
     a, b, c = vertices[corners].transpose(1, 0, 2)
     return np.asarray(np.cross(b - a, c - a))
 
 
 def unit(vectors: NDArray[Any]) -> Points:
-    """Scale vectors (..., 3) to length 1; zero vectors are unchanged."""
+    """Scale vectors (..., 3) to length 1. Zero vectors are unchanged."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
-    """Return cosines (t, 3) of the angle between the normals of each triangle and its neighbour at the side opposite to
-    each corner; -1 for sides without exactly one neighbour."""
+    """Return the cosine of the angle between a triangle and its neighbour at the side opposite to each corner (t, 3).
+    It is -1 for sides without exactly one neighbour."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -63,17 +64,17 @@ def cosines_of(vertices: Points, corners: Numbers) -> Points:
 class ShownSolid:
     name: str
     shape: Solid
-    """Shape about the solid's middle, not rotated; for a tank, of the cavity."""
+    """Shape relative to the solid's middle, without rotation. The shape of a tank is its cavity."""
     position: Points
-    """(d,) position of the solid's middle [m]"""
+    """Position of the solid's middle (d,) [m]."""
     turn: Points
-    """(d, d) rotation matrix"""
+    """Rotation matrix (d, d)."""
     finish: Finish
     is_tank: bool
 
     @property
     def colour(self) -> Points:
-        """(3,) linear."""
+        """Linear colour (3,)."""
         return np.array(self.finish.colour)
 
     @property
@@ -86,17 +87,16 @@ class ShownSolid:
 
     @property
     def solid(self) -> Solid:
-        """The region that fluid cannot enter: for a tank, the outside of the cavity."""
+        """Region that fluid cannot enter. For a tank it is the outside of the cavity."""
         return Hollow(self.body) if self.is_tank else self.body
 
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """Return the solid in coordinates with axes ``frame`` (d, d) and origin ``origin`` (d,) [m]."""
+        """Return the solid in coordinates with axes ``frame`` (d, d) and an ``origin`` (d,) [m]."""
         return replace(self, position=frame @ (self.position - origin), turn=frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Return the solids of a scene at the poses in its tables, within the period, followed by periodic images that
-    reach into the container."""
+    """Return the solids of a scene, moved into the periodic box, with their periodic images in the container."""
     found, domain = [], scene.domain
     for table in scene.solid:
         shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
@@ -120,30 +120,30 @@ def extents_of_solids(scenes: Iterable[Scene]) -> list[tuple[Points, Points]]:
 
 
 def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of the smallest box around boxes, given as pairs of ends."""
+    """Return the lower and the upper corner (d,) [m] of the smallest box around several boxes."""
     both = np.array(boxes)
     return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
 
 SIDES = 48
 FLAT = 1.0 - 1e-9
-"""Cosine of the angle between two triangles below which they do not count as coplanar."""
+"""Cosine of the angle between two normals above which triangles count as coplanar."""
 
 
 def solid_outline(scene: Scene) -> Points:
-    """Return ends (k, 2, d) [m] of the outlines of a scene's solids at rest; k is 0 without solids."""
+    """Return the outlines of the solids of a scene at rest as line segments (k, 2, d) [m]."""
     lines = [own_lines(one) @ one.turn.T + one.position for one in shown_solids(scene)]
     return np.concatenate([np.zeros((0, 2, scene.dimension)), *lines])
 
 
 def own_faces(shown: ShownSolid) -> Faces:
-    """Return a solid's faces about its middle, not rotated; few enough for outlines and viewers."""
+    """Return the faces of a solid relative to its middle, without rotation."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
     return shown.shape.shown_faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:
-    """Return ends (k, 2, d) [m] of a solid's outline about its middle, not rotated."""
+    """Return the outline of a solid relative to its middle, without rotation, as line segments (k, 2, d) [m]."""
     faces = own_faces(shown)
     if len(shown.turn) == 2:
         return faces.vertices[faces.corners]
@@ -155,7 +155,8 @@ def own_lines(shown: ShownSolid) -> Points:
 
 
 def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
-    """Return lines (k, 2, 3) [m] in which triangles intersect the plane through the origin perpendicular to an axis."""
+    """Intersect triangles with the plane through the origin perpendicular to an axis. Return line segments (k, 2, 3)
+    [m]."""
     above = points[:, axis] >= 0.0
     crossing = corners[(above[corners] != above[corners[:, :1]]).any(axis=1)]
     start, end = points[sides_of(crossing)].transpose(1, 0, 2)
@@ -166,10 +167,11 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller ones, and return the parent (p,) of each.
+    """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller triangles. Return vertices, triangles, and the number of
+    the original triangle for each new triangle.
 
     Each side is cut into 2^k equal parts no longer than ``longest`` [m], with the least k, so that adjacent triangles
-    fit. Other sides of the parts are longer by at most a factor of the square root of 2.
+    fit. New sides inside a triangle are at most longer by a factor of the square root of 2.
     """
     parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
     thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)
@@ -204,8 +206,8 @@ def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float
 
 
 def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
-    """Cut triangles (t, 3) into parts: ``middles`` (t, 3) are the new vertices on the sides opposite to each corner, or
-    -1."""
+    """Cut triangles (t, 3) into parts. ``middles`` (t, 3) are new vertices on the sides opposite to each
+    corner, or -1."""
     count, found, own = (middles >= 0).sum(axis=1), [], []
 
     def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
@@ -224,8 +226,6 @@ def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers,
 
 
 def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> tuple[Points, Numbers, Numbers]:
-    """Cut thin triangles (t, 3, 3) [m] across their long sides: the side from the first corner to the second into
-    ``first`` parts, the side to the third corner into ``second`` parts."""
     tip, *ends = triangles.transpose(1, 0, 2)
     rows = [tip + (k / n) * (end - tip) for n, end in zip((first, second), ends, strict=True) for k in range(1, n + 1)]
     vertices = np.stack([tip, *rows], axis=1)
@@ -244,24 +244,23 @@ def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> 
 
 
 ROUNDS = 8
-"""Rounds of smoothing, which removes steps in the light on round solids caused by few light directions."""
+"""Number of smoothing iterations for the light on round solids."""
 FAR = 1e9
-"""Distance [m] assigned to triangles without a sharp edge."""
 
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """A triangle mesh of solids in space; seen from outside, corners run counterclockwise."""
+    """A triangle mesh of solids in space. Seen from outside, the corners of a triangle run counterclockwise."""
 
     points: Points
-    """(p, 3) [m]"""
+    """Points (p, 3) [m]."""
     normals: Points
-    """(p, 3) unit vectors outwards"""
+    """Outward unit vectors (p, 3)."""
     triangles: Numbers
-    """(t, 3) numbers of points"""
+    """Indices of the points of each triangle (t, 3)."""
     from_edges: Points
-    """(t, 3, 3) distance [m] of each corner (column) from each side (row) of the face to which the triangle belongs;
-    `FAR` if the side is no sharp edge"""
+    """Distance of each corner (column) from each side (row) of a triangle (t, 3, 3) [m]. It is `FAR` for sides that are
+    not sharp edges."""
 
     @classmethod
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
@@ -275,7 +274,7 @@ class SolidMesh:
         return cls(points[corners.ravel()[chosen]], normals.reshape(-1, 3)[chosen], number.reshape(-1, 3), from_edges)
 
     def smoothed(self, values: Points) -> Points:
-        """Smooth values (p, c) at points along the surface but not across sharp edges."""
+        """Smooth values at points (p, c) along the surface, but not across sharp edges."""
         from scipy.sparse import csr_matrix
 
         ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -302,7 +301,8 @@ class SolidMesh:
 
 
 def _normals(corners: Numbers, across: Points) -> Points:
-    """Return at each corner (t, 3, 3) the mean normal of the adjacent triangles, except those beyond sharp edges."""
+    """Return the mean normal of the adjacent triangles at each corner (t, 3, 3). Triangles beyond sharp edges do not
+    count."""
     order = np.argsort(corners.ravel(), kind="stable")
     counts = np.bincount(corners.ravel())
     ends = np.cumsum(counts)
@@ -318,8 +318,6 @@ def _normals(corners: Numbers, across: Points) -> Points:
 
 
 def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Numbers) -> Points:
-    """Compute `SolidMesh.from_edges` of triangles (p, 3, 3) [m] that are parts of ``parents`` (p,) among triangles (t,
-    3)."""
     sides = points[sides_of(corners).reshape(-1, 3, 2)]
     across = unit(across_of(points, corners))
     inwards = unit(np.cross(across[:, None], sides[:, :, 1] - sides[:, :, 0]))

@@ -1,4 +1,4 @@
-"""The surroundings of fluid in a 3-D picture: up direction, floor, container, lamps and camera."""
+"""The surroundings of fluid in a 3-D picture: the up direction, the floor, the container, the lamps and the camera."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -14,32 +14,29 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, CylinderContainer
 
 DROPS = 0.002
-"""Fraction of particles at each end of an axis that may lie outside the picture."""
 SPILT, BEYOND = 0.1, 0.15
-"""Fraction of particles at each end of an axis that does not widen the picture if far away."""
 NEAR = 0.25
-"""Distance from first state, solids and container within which every drop counts, relative to their size."""
+"""Distance from the first state within which every drop is shown, relative to the size of the first state."""
 ENOUGH = 1_000_000
-"""Number of positions, sampled from all particles and frames, that determine the fluid's extent."""
+"""Number of sampled positions that determine the extent of the fluid."""
 
 
 Box = tuple[Points, Points]
-"""Two points (d,) [m], such as lower and upper ends."""
+"""Two points (d,) [m], such as two corners."""
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
-    """Return states (m, d) [m] that determine the fluid's extent, within the period, from positions (n, d) or (frames,
-    n, d) [m]."""
+    """Return a sample of the positions (n, d) or (frames, n, d) [m], as states (m, d) [m] inside the periodic box."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
     return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
 
 
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of the fluid that a picture shows, in states (n, d) [m].
+    """Return the lower and the upper corner (d,) [m] of the shown fluid in states (n, d) [m].
 
-    All of the first state counts. Of later states the bulk counts, and drops near the box around the first state and
-    ``around``. Drops that fall far away do not shrink the picture.
+    The whole first state is shown. Of later states only the bulk is shown, and drops near the first state and near the
+    boxes ``around``. Drops that fall far away do not make the picture smaller.
     """
     first, *later = states
     found = [_ends(first, DROPS)]
@@ -55,25 +52,26 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return lower and upper ends (d,) [m] of positions (n, d) [m], without a fraction ``share`` at both ends of each
-    axis."""
+    """Return the lower and the upper corner (d,) [m] of positions (n, d) [m], without the outermost fraction ``share``
+    along each axis."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
 
 TINT = 2.6
-"""Scattering depth / depth at which light takes the fluid's colour, for fluids without a material."""
+"""Ratio of absorption to scattering for fluids without a material."""
 SPAN = 0.1
-"""Thickness of fluid for which transparency is defined, relative to the size of the contents."""
+"""Thickness of fluid in the definition of transparency, relative to the size of the contents."""
 LAYERS, LAYERS_OF_SPHERES = 3.0, 1e3
 """Number of scattering events within one spacing of opaque fluid, and of spheres."""
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """Return scattering and absorption (phases, 2) [1/m] for contents of ``size`` [m], and the mean over phases of the
-    fraction of light transmitted through `SPAN`.
+    """Return scattering and absorption (phases, 2) [1/m] for contents of ``size`` [m], and the transparency. The
+    transparency is the mean fraction of light that passes through the thickness `SPAN`.
 
-    A phase's material sets the values, unless the picture sets a transparency, or colours that are not those of phases.
+    The material of a phase determines the values, unless the picture sets a transparency or does not show the colours
+    of phases.
     """
     picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
     by_phase, transparency = picture.colour == "phase", picture.transparency
@@ -96,52 +94,51 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
 
 
 MARGIN = 1.10
-"""Ratio of a picture's width to that of its contents."""
+"""Ratio of the width of a picture to the width of its contents."""
 AROUND = 1.08
-"""Distance factor for an orbiting camera, because the contents are not central from all sides."""
 AIR = 0.1
-"""Space beside fluid without a container, relative to the fluid's width."""
+"""Space beside fluid without a container, relative to the width of the fluid."""
 FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
-"""Elevation of the camera [degrees], for a view into an opaque cup and for all other views."""
+"""Elevation of the camera above an opaque cup, and in front of any other scene [degrees]."""
 AZIMUTH = 24.0
-"""Azimuth of the camera [degrees], to the right of the direction towards the viewer."""
+"""Azimuth of the camera, positive to the right [degrees]."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Everything around the fluid, in picture axes: y is up, and the origin is in the middle of the picture's
+    """The surroundings of the fluid in picture axes. The y axis points up, and the origin is in the middle of the
     contents."""
 
     frame: Points
-    """(3, 3) rotation from the scene's axes to picture axes"""
+    """Rotation from the axes of the scene to picture axes (3, 3)."""
     origin: Points
-    """(3,) [m], in the scene's axes"""
+    """Origin of the picture axes in the scene (3,) [m]."""
     lower: Points
-    """(3,) lower ends of the contents [m], in picture axes"""
+    """Lower corner of the contents in picture axes (3,) [m]."""
     upper: Points
-    """(3,) [m]"""
+    """Upper corner of the contents in picture axes (3,) [m]."""
     seen: tuple[Points, Points]
-    """Lower and upper ends (3,) [m] of the region that the camera sees, in picture axes."""
+    """Lower and upper corner (3,) [m] of the camera's region, in picture axes."""
     elevation: float
-    """[degrees]"""
+    """Elevation of the camera [degrees]."""
     eye: Points
-    """(3,) position of the camera [m]"""
+    """Position of the camera (3,) [m]."""
     look_at: Points
-    """(3,) [m]"""
+    """Point at which the camera looks (3,) [m]."""
     azimuth: float
-    """Azimuth [degrees] of the camera's home view; the lamps do not move with the camera."""
+    """Azimuth of the camera in the first view [degrees]."""
     picture: Picture
     container: Any
     spacing: float
-    """[m]"""
+    """Particle spacing [m]."""
     transparency: float
-    """Fraction of light transmitted through fluid of thickness `SPAN`."""
+    """Fraction of light that passes through the thickness `SPAN` of fluid."""
     media: Points
-    """(phases, 2) scattering and absorption [1/m], as `media_of`"""
+    """Scattering and absorption (phases, 2) [1/m] from `media_of`."""
     cuts: bool
     """True if fluid is shown only inside the container."""
     solids: tuple[ShownSolid, ...]
-    """In picture axes."""
+    """Solids in picture axes."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
@@ -170,8 +167,8 @@ class Stage:
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """Return the stage for a picture of another size, with a camera that sees all between ``ends`` (3,) [m] in the
-        scene's axes."""
+        """Return the stage for a picture of a new size. The camera sees everything between the corners ``ends`` (3,)
+        [m] in the axes of the scene."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
         if picture.look_at is not None:
@@ -189,7 +186,7 @@ class Stage:
 
     @property
     def seen_size(self) -> Points:
-        """Width and height (2,) [m] of the camera's view of the contents, perpendicular to its direction."""
+        """Width and height of the camera's view at the contents (2,) [m]."""
         return np.ptp(corners(*self.seen) @ np.stack(screen_axes(self.look_at - self.eye), axis=1), axis=0)
 
     @property
@@ -198,7 +195,8 @@ class Stage:
 
     @property
     def home_around(self) -> View:
-        """The home view from far enough to see all from every side, unless [picture] sets the camera's position."""
+        """First view of an orbiting camera, which sees all contents from every side. If [picture] sets the position of
+        the camera, the view starts there."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -209,8 +207,7 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """Return the stage with solids at the poses in the scene ``pose``, and with the camera at ``view``, unless
-        None."""
+        """Return the stage with the solids of the scene ``pose`` and the camera at ``view``. None changes nothing."""
         found = self
         if pose is not None:
             solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
@@ -222,26 +219,25 @@ class Stage:
 
     @property
     def cuts_solids(self) -> bool:
-        """True if solids are shown only inside the container; False without container and for a cup without a lid."""
+        """True if solids are shown only inside the container."""
         return bool(getattr(self.container, "lid", self.container.extent() is not None))
 
     @property
     def size(self) -> float:
-        """[m]"""
+        """Greatest side of the contents [m]."""
         return float((self.upper - self.lower).max())
 
     @property
     def clearness(self) -> float:
-        """Fraction of light that reaches fluid through other fluid."""
         return 0.85 * self.transparency
 
     def placed(self, positions: Points) -> Points:
-        """Convert positions (n, 3) [m] from the scene's axes to picture axes."""
+        """Convert positions (n, 3) [m] from the axes of the scene to picture axes."""
         return (positions - self.origin) @ self.frame.T
 
     def on_screen(self, points: Points) -> Points:
-        """Return column and row (n, 2) in the picture, in pixels from the upper left corner, of points (n, 3) [m] of
-        the scene."""
+        """Return the column and row in the picture (n, 2) of points of the scene (n, 3) [m], in pixels from the upper
+        left corner."""
         forward = self.look_at - self.eye
         forward = forward / np.linalg.norm(forward)
         off = self.placed(points) - self.eye
@@ -255,7 +251,7 @@ class Stage:
 
     @property
     def glass_frame(self) -> Points:
-        """The rotation (3, 3) from picture axes to axes of which a cylinder's axis is the second."""
+        """Rotation (3, 3) from picture axes to container axes. The axis of a cylinder is the second container axis."""
         if not isinstance(self.container, CylinderContainer):
             return np.eye(3)
         axis = INDEX_OF_AXIS[self.container.axis]
@@ -264,12 +260,12 @@ class Stage:
 
     @property
     def glass_ends(self) -> tuple[Points, Points]:
-        """Lower and upper ends of the container [m], (3,) each, in the axes of `glass_frame`."""
+        """Lower and upper corner of the container (3,) [m], in the axes of `glass_frame`."""
         return _box(self.placed(corners(*self.container.extent())) @ self.glass_frame.T)
 
     @property
     def room(self) -> tuple[Points, Points]:
-        """Ends [m], (3,) each, of the region where fluid is shown, in the axes of `glass_frame`. The ends are infinite
+        """Lower and upper corner (3,) [m] of the shown fluid, in the axes of `glass_frame`. The region is infinite
         along periodic axes and upwards, because emitters may be above the container."""
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
@@ -283,7 +279,8 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """(2, 3), 1 where a box has a pane of glass at its lower and upper ends, else 0."""
+        """Mask (2, 3) of the sides of a box that are panes of glass. Rows are lower and upper ends, and columns are
+        axes."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -292,13 +289,13 @@ class Stage:
 
     @property
     def sun(self) -> Points:
-        """Unit vector (3,)."""
+        """Unit vector (3,) towards the main lamp."""
         light = self.picture.sun_and_sky
         return _towards(self.azimuth + light.azimuth, light.elevation)
 
     @property
     def fill(self) -> Points:
-        """Unit vector (3,)."""
+        """Unit vector (3,) towards the second lamp."""
         return _towards(self.azimuth + 70.0, 28.0)
 
 
@@ -315,8 +312,8 @@ def spilled(container: Container, positions: Points, spacing: float) -> bool:
 
 
 def upright(gravity: Points) -> Points:
-    """Return the rotation (3, 3) from the scene's axes to (right, up, towards the viewer). Up is the axis opposite to
-    gravity (3,), or y without gravity."""
+    """Return the rotation (3, 3) from the axes of the scene to the directions right, up, and towards the viewer. Up is
+    the axis opposite to gravity (3,), or y without gravity."""
     axis = int(np.abs(gravity).argmax()) if gravity.any() else 1
     up, towards = np.zeros(3), np.zeros(3)
     up[axis] = -1.0 if gravity[axis] > 0.0 else 1.0
@@ -325,13 +322,13 @@ def upright(gravity: Points) -> Points:
 
 
 def _towards(azimuth: float, elevation: float) -> Points:
-    """Return a unit vector (3,); the azimuth [degrees] counts from the viewer's direction to the right."""
     a, e = np.radians([azimuth, elevation])
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
 def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH) -> Box:
-    """Return the camera's position and its target point, (3,) each [m], so that a box fills the picture."""
+    """Return the position of the camera (3,) [m] and the point in the middle of its view (3,) [m], so that a box fills
+    the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN
     halves = half, half * picture.height / picture.width
@@ -348,7 +345,8 @@ def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azi
 
 
 def screen_axes(forward: Points) -> tuple[Points, Points]:
-    """Return unit vectors (3,) to the right and upwards on the screen of a camera that looks along ``forward`` (3,)."""
+    """Return the unit vectors (3,) to the right and upwards on the screen, for the viewing direction
+    ``forward`` (3,)."""
     helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 * np.linalg.norm(forward) else np.array([0, 0, -1.0])
     right = np.cross(forward, helper)
     right /= np.linalg.norm(right)

@@ -1,4 +1,4 @@
-"""Differentiable rendering of particles: colour field on a grid, camera, image.
+"""Differentiable rendering of particles through a colour field on a grid.
 
 Names are imported on first use, so that importing ``cortado.render`` is fast.
 """

@@ -1,13 +1,14 @@
-"""Emission and absorption along a ray, front to back (Max 1995), through the colour field (P, A).
+"""Emission and absorption of light along a ray through the colour field, from front to back (Max 1995).
 
-A sample of optical thickness u = kappa ds A (extinction kappa, step ds) transmits the fraction exp(-u) of the light
-from behind. It adds kappa ds P E(u), with E(u) = (1 - exp(-u)) / u: the emission of a layer of colour P / A, without
-the division. With T_0 = 1,
+The colour field consists of the coverage A and the colour times coverage P. A sample of optical thickness u = kappa ds
+A, with extinction kappa and step ds, transmits the fraction exp(-u) of the light from behind it. The sample adds kappa
+ds P E(u), with E(u) = (1 - exp(-u)) / u. This is the emission of a layer of colour P / A, written without a division by
+A. With the transmittance T_s in front of sample s of S samples, and T_0 = 1,
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 
-In the adjoint, the light from behind a sample is the image minus the light summed up to the sample. One pass over
-the samples therefore suffices, even if they are dark.
+In the adjoint, the light from behind a sample is the image minus the light of all samples before it. One pass over the
+samples is therefore enough.
 """
 
 from functools import cache, cached_property, partial
@@ -27,24 +28,21 @@ from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.rays import camera_tangent_type, camera_type, interpolation_functions, ray_functions
 
 SAMPLES_PER_CELL = 2
-"""Number of samples of a ray per node distance."""
 
 
 @cache
 def pose_type(precision: Precision) -> Any:
-    """Return the Warp vector type of a pose's adjoint: three numbers for the position, three for a rotation about
-    it."""
     return wp.types.vector(length=6, dtype=precision.real)
 
 
 @cache
 def brightness_functions(precision: Precision) -> tuple[Any, Any]:
-    """Return Warp functions E(u) = (1 - exp(-u)) / u and E'(u); both take u and exp(-u)."""
+    """Return Warp functions of E(u) = (1 - exp(-u)) / u and of its derivative. The arguments are u and exp(-u)."""
     real = precision.real
 
     @wp.func
     def brightness(u: real, passed: real) -> real:
-        """Return E(u); below 0.1, where the formula cancels, by the series sum_n (-u)^n / (n + 1)!, to 1e-17."""
+        """Return E(u). For u below 0.1 the series sum_n (-u)^n / (n + 1)! is used."""
         if u > real(0.1):
             return (real(1.0) - passed) / u
         total = real(1.0)
@@ -54,7 +52,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
     @wp.func
     def brightness_derivative(u: real, passed: real) -> real:
-        """Return E'(u); below 0.1 by the series -sum_n (n + 1) (-u)^n / (n + 2)!."""
+        """Return the derivative of E(u). For u below 0.1 the series -sum_n (n + 1) (-u)^n / (n + 2)! is used."""
         if u > real(0.1):
             return (passed * (real(1.0) + u) - real(1.0)) / (u * u)
         total = real(1.0)
@@ -67,8 +65,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
-    """Return the kernels over pixels that march along rays through the colour field, and the kernel over nodes from the
-    adjoints of samples to those of nodes."""
+    """Return the kernels of ray marching, and the kernel of the adjoint of the colour field."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     change = camera_tangent_type(precision)
@@ -90,7 +87,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def march(camera, nodes, thickness: real, background: vector, field, image, spans):
-        """Compute the image of a field, and in ``spans`` the range of samples of each ray that may lie in the field."""
+        """Compute the image of a field. ``spans`` are the ranges of samples inside the grid for each ray."""
         pixel = wp.tid()
         o = start(pixel, camera)
         d = direction(pixel, camera)
@@ -143,7 +140,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     def march_adjoint(
         camera, nodes, thickness: real, field, image, spans, image_bar, samples_bar: samples, pose_bar: poses
     ):
-        """Compute the adjoints of samples, [sample of the span, pixel], and of the pose, for each ray."""
+        """Compute the adjoints of the samples of each ray, and of the camera's pose."""
         pixel = wp.tid()
         bar = image_bar[pixel]
         o = start(pixel, camera)
@@ -175,7 +172,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def gather(camera, nodes, spans, samples_bar: samples, field_bar):
-        """Sum each node's adjoint over the samples in the eight cells around the node."""
+        """Compute the adjoint of each node from the adjoints of samples in the eight cells around the node."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         lower = x_g - diagonal(nodes)
@@ -197,7 +194,6 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
 
 
 def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
-    """Return the Warp struct of a camera with samples ``step`` [m] apart."""
     struct = camera_type(precision)()
     struct.position = precision.vector(*camera.position)
     struct.orientation = type(struct.orientation)(*camera.orientation.ravel())
@@ -217,10 +213,9 @@ def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any
 
 
 class RayMarcher:
-    """Renders fields to pictures of one view by ray marching; `adjoint` overwrites its last result."""
+    """Renders colour fields in one view by ray marching. Each call of ``adjoint`` overwrites the previous result."""
 
     def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
-        """Allocate for a view of a grid of nodes, which is `ColourField.nodes`."""
         self._step = step = nodes.cell / SAMPLES_PER_CELL
         self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
@@ -230,7 +225,7 @@ class RayMarcher:
         self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
         require(picture_parts(self.pixels, precision.bytes), "take a smaller resolution", device)
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
-        """(pixels,) linear RGB, row by row."""
+        """Image and its adjoint (pixels,), in linear RGB."""
         self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
         self._known = {"camera": self._camera, "nodes": nodes, "thickness": self._thickness}
         self._known |= {"image": self.image, "spans": self._spans}
@@ -241,16 +236,16 @@ class RayMarcher:
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
-        """Return the tangent (pixels,) of the image, along tangents of the field and of the view. The next call of
-        `tangent` or `adjoint` overwrites the result."""
+        """Return the tangent (pixels,) of the image along tangents of the field and of the view. The next call of
+        ``tangent`` or ``adjoint`` overwrites the result."""
         camera_dot = camera_tangent(along, self._step, self._precision)
         given = {"background": self._background, "field": field, "field_dot": field_dot, "camera_dot": camera_dot}
         launch(self._kernels.tangent, self.pixels, self._device, self._known, given, image_dot=self._image_bar)
         return self._image_bar
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
-        """Return derivatives with respect to the field and the pose (6,), given that with respect to the image (pixels,
-        3)."""
+        """Return derivatives with respect to the field and the pose (6,), given the derivative with respect to the
+        image (pixels, 3)."""
         self._image_bar.assign(image_bar)
         bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
         launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)
@@ -259,8 +254,6 @@ class RayMarcher:
 
     @cached_property
     def _samples_bar(self) -> wp.array:
-        """Adjoints of samples (samples, pixels): by far the largest array, allocated on first use. The field's diagonal
-        limits the number of samples of a ray."""
         cells = np.linalg.norm(np.array(self._nodes.shape) + 1)
         samples = min(int(cells * SAMPLES_PER_CELL) + 4, self._camera.samples)
         parts = sample_parts(samples, self.pixels, self._precision.bytes)

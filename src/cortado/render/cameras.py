@@ -1,6 +1,6 @@
-"""Cameras and views; a view is a camera, the fluid's extinction and the background.
+"""Cameras and views. A view consists of a camera, the extinction of the fluid and the background.
 
-If a view is not known exactly, `Calibration` makes its camera's numbers parameters.
+A `Calibration` turns unknown numbers of a view into parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,8 @@ Vector = tuple[float, ...]
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
-    """Return finite numbers as a tuple of a length; raises `InputError`, naming the argument ``name``."""
+    """Return ``values`` as a tuple of the given length. Raises `InputError` unless they are finite numbers. Errors
+    mention the argument ``name``."""
     found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
@@ -32,20 +33,20 @@ def positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class Camera:
-    """The base of all cameras. Samples along a ray have fixed distances between ``near`` and ``far``."""
+    """Base class of cameras. Samples on a ray are evenly spaced between ``near`` and ``far``."""
 
     position: Vector
     """Position of the camera [m], (3,)."""
     look_at: Vector
     """Point in the middle of the picture [m], (3,)."""
     up: Vector
-    """Direction (3,) that points upwards in the picture; not parallel to the viewing direction."""
+    """Direction (3,) that points upwards in the picture. It must not be parallel to the viewing direction."""
     resolution: tuple[int, int] = field(default=(256, 256), kw_only=True)
     """Numbers of columns and rows; pixels are square."""
     near: float = field(default=0.0, kw_only=True)
-    """Distance of the first sample's layer [m]."""
+    """Distance from the camera to the first samples [m]."""
     far: float | None = field(default=None, kw_only=True)
-    """Distance at which samples end [m]; by default twice that of ``look_at``."""
+    """Distance from the camera to the last samples [m], by default twice the distance to ``look_at``."""
 
     def __post_init__(self) -> None:
         for name in ("position", "look_at", "up"):
@@ -65,7 +66,7 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """``far``, after its default has been filled in [m]."""
+        """Distance ``far`` [m], or its default."""
         assert self.far is not None
         return self.far
 
@@ -80,14 +81,14 @@ class Camera:
 
     @property
     def half_width(self) -> tuple[float, float]:
-        """Half of the width seen at the camera [m], and its growth per depth [-]."""
+        """Half of the visible width at the camera [m], and its growth per unit of depth [-]."""
         raise NotImplementedError
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
-        """Return the camera shifted by a vector (3,) [m] and turned about its own position by a rotation vector (3,)
+        """Return the camera after a translation (3,) [m] and a rotation about its position by a rotation vector (3,)
         [rad].
 
-        The renderer returns derivatives with respect to these six numbers, at zero.
+        The renderer returns derivatives with respect to the translation and rotation at zero.
         """
         from scipy.spatial.transform import Rotation
 
@@ -102,8 +103,8 @@ class Camera:
 class Orthographic(Camera):
     """A camera with parallel rays.
 
-    The camera at ``position`` (3,) [m] looks at ``look_at`` [m], with ``up`` upwards. The picture is ``width`` [m]
-    wide, shows depths from ``near`` to ``far`` [m], and has ``resolution`` (columns, rows).
+    The camera is at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` upwards. The picture is ``width``
+    [m] wide, shows depths from ``near`` to ``far`` [m], and has ``resolution`` (columns, rows).
 
     Example::
 
@@ -112,7 +113,7 @@ class Orthographic(Camera):
     """
 
     width: float
-    """Width of the region that the picture shows [m]."""
+    """Width of the shown region [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,8 +129,9 @@ class Orthographic(Camera):
 class Perspective(Camera):
     """A camera with rays from one point.
 
-    The camera at ``position`` (3,) [m] looks at ``look_at`` [m], with ``up`` upwards and a horizontal ``field_of_view``
-    [degrees]. The picture shows depths from ``near`` to ``far`` [m] and has ``resolution`` (columns, rows).
+    The camera is at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` upwards. Its horizontal angle of
+    view is ``field_of_view`` [degrees]. The picture shows depths from ``near`` to ``far`` [m] and has ``resolution``
+    (columns, rows).
 
     Example::
 
@@ -138,7 +140,7 @@ class Perspective(Camera):
     """
 
     field_of_view: float
-    """Angle that the width of the picture spans [degree]."""
+    """Horizontal angle of view [degree]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -151,7 +153,7 @@ class Perspective(Camera):
 
 
 def check_resolution(resolution: tuple[int, int]) -> None:
-    """Raise `InputError` unless ``resolution`` is two positive whole numbers, columns and rows."""
+    """Raise `InputError` unless ``resolution`` is two positive whole numbers."""
     whole = isinstance(resolution, Sequence) and all(is_whole(n) and n > 0 for n in resolution)
     if not whole or len(resolution) != 2:
         raise InputError(
@@ -162,36 +164,36 @@ def check_resolution(resolution: tuple[int, int]) -> None:
 WHITE = (1.0, 1.0, 1.0)
 ZERO = (0.0, 0.0, 0.0)
 NUDGE = 1e-6
-"""Step of a rotation vector [rad], for finite differences of a turned camera's rotation."""
+"""Step of finite differences with respect to a rotation vector [rad]."""
 
 
 class View(Protocol):
-    """Protocol of a view for the renderer: camera, extinction and background."""
+    """Protocol of views: a camera, the extinction of fluid and the background."""
 
     @property
     def camera(self) -> Camera: ...
 
     @property
     def extinction(self) -> float:
-        """Extinction of filled fluid [1 / m]."""
+        """Extinction of fluid with coverage 1 [1 / m]."""
         ...
 
     @property
     def background(self) -> Vector:
-        """Background in linear RGB, (3,)."""
+        """Background colour (3,), in linear RGB."""
         ...
 
 
 @public
 @dataclass(frozen=True)
 class Volume:
-    """A view of translucent fluid, from any camera."""
+    """A view of translucent fluid through any camera."""
 
     camera: Camera
     extinction: float
-    """Extinction of filled fluid [1 / m]: after 1 / extinction, 1 / e of the light is left."""
+    """Extinction of fluid with coverage 1 [1 / m]. Light is reduced to 1 / e over the length 1 / extinction."""
     background: Vector = WHITE
-    """Background in linear RGB, (3,)."""
+    """Background colour (3,), in linear RGB."""
 
     def __post_init__(self) -> None:
         positive("extinction", self.extinction)
@@ -201,25 +203,25 @@ class Volume:
 @public
 @dataclass(frozen=True)
 class TopView:
-    """A view of the free surface's colour from above, as a barista sees latte art.
+    """A view of the free surface from above, as a barista sees latte art.
 
-    The picture shows the whole container, seen downwards along the up axis, not mirrored. Columns run left to right
-    along the first of the other two axes. With y upwards, rows run along z: row 0 has the lowest z. With z upwards,
-    rows run against y, as in a plot; with x upwards, columns run along y and rows against z.
+    The picture shows the whole container along the up axis, not mirrored. With y upwards, columns run along x and rows
+    along z, with the lowest z in row 0. With z upwards, columns run along x and rows against y, as in a plot. With x
+    upwards, columns run along y and rows against z.
     """
 
     lower: Vector
-    """Corner of the container [m], (2,) or (3,); in 2-D the camera looks at the plane, and ``up_axis`` is 2."""
+    """Lower corner of the container [m], (2,) or (3,). In 2-D the camera looks at the plane, and ``up_axis`` is 2."""
     upper: Vector
     spacing: float
-    """Spacing of the particles [m]."""
+    """Particle spacing [m]."""
     resolution: tuple[int, int] = (256, 256)
     """Numbers of columns and rows."""
     up_axis: int = 1
     opacity: float = 4.0
-    """Extinction times spacing [-]: a larger value hides the layers below the first layer of particles better."""
+    """Extinction times particle spacing [-]. A large value hides the fluid below the first layer of particles."""
     background: Vector = WHITE
-    """Background in linear RGB, (3,)."""
+    """Background colour (3,), in linear RGB."""
 
     def __post_init__(self) -> None:
         length = 2 if np.shape(self.lower) == (2,) else 3
@@ -258,21 +260,21 @@ class TopView:
 
 @dataclass(frozen=True)
 class ViewTangent:
-    """A change of a view: the direction of a directional derivative."""
+    """A direction of change of a view, for a directional derivative."""
 
     translation: Vector = ZERO
     """Translation of the camera (3,) [m]."""
     rotation: Vector = ZERO
     """Rotation vector (3,) of the camera about its position [rad]."""
     half_width: tuple[float, float] = (0.0, 0.0)
-    """Change of `Camera.half_width`: at the camera [m], and of its growth with depth [-]."""
+    """Change of `Camera.half_width`: half width at the camera [m], and growth with depth [-]."""
     extinction: float = 0.0
-    """Change of the extinction of filled fluid [1 / m]."""
+    """Change of the extinction [1 / m]."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Unknown numbers of a view as parameters, starting from an approximate (``aimed``) view.
+    """Unknown numbers of a view as parameters. The approximate view is ``aimed``.
 
     The parameters are "translation" (3,) [m] and "rotation" (3,) [rad] of the camera, its "field_of_view" [degrees] or,
     with parallel rays, "width" [m], and the "extinction" of the fluid [1/m].
@@ -289,13 +291,13 @@ class Calibration:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """Values of the unknown numbers in the aimed view."""
+        """Values of the unknown numbers in the view ``aimed``."""
         return {name: self._values[name] for name in self.names}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """Masks by name, True for numbers without effect on pictures: the shift of a camera with parallel rays along
-        its axis-aligned viewing direction."""
+        """Masks by name that are True for numbers without effect on pictures. An example is the movement of a camera
+        with parallel rays along the viewing direction."""
         camera = self.aimed.camera
         if "translation" not in self.names or not isinstance(camera, Orthographic):
             return {}
@@ -303,7 +305,7 @@ class Calibration:
         return {"translation": np.isclose(np.abs(sight), np.linalg.norm(sight))}
 
     def view(self, values: Mapping[str, np.ndarray]) -> View:
-        """Return the view with these values; raises `InputError` for impossible ones."""
+        """Return the view with the given values. Raises `InputError` for invalid values."""
         if not self.names:
             return self.aimed
         all_values = {**self._values, **values}
@@ -315,7 +317,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """Return the change of the view at ``values`` along ``directions`` of some of them."""
+        """Return the change of the view at ``values`` along ``directions``. Omitted directions are 0."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO
@@ -332,7 +334,6 @@ class Calibration:
 
     @property
     def _values(self) -> dict[str, np.ndarray]:
-        """All numbers of the aimed view, by name."""
         camera = self.aimed.camera
         found = {"translation": np.zeros(3), "rotation": np.zeros(3), "extinction": np.array(self.aimed.extinction)}
         if isinstance(camera, Perspective):

@@ -1,13 +1,13 @@
 """The colour field: coverage by fluid and colour at the nodes of a regular grid.
 
-The colour of a particle is mixed from its phases' colours. Coverage and colour are spread over the nodes around it:
+The colour of particle j is mixed from the colours of its phases k by their mass fractions c_jk. The coverage A_g and
+the colour times coverage P_g at a node g are sums over particles at x_j of volume V, with the smoothing kernel W and
+the position x_g of the node:
 
     colour_j = sum_k c_jk colours_k
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 
-The coverage A is 1 inside the fluid. P is colour times coverage; no formula divides by A. Along periodic axes a
-particle's images count like the particle. The sums are gathers: a node sums over particles, cell by cell; in the
-adjoint a particle sums over the nodes within its support.
+The coverage is 1 inside the fluid. Periodic images of particles are included.
 """
 
 from collections.abc import Mapping
@@ -30,22 +30,20 @@ from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation
 
 MOST_NODES = 2**27
-"""2 GiB in float32."""
+"""Greatest number of nodes."""
 MOST_CELLS = 2**20
-"""Greatest number of cells of the grid in which particles are sorted."""
+"""Greatest number of cells for sorting particles."""
 
 
 @cache
 def rgba_type(precision: Precision) -> Any:
-    """Return the Warp vector type of (P, A): colour times coverage, three components, and coverage."""
     return wp.types.vector(length=4, dtype=precision.real)
 
 
 @cache
 def nodes_type(precision: Precision) -> Any:
-    """Return the Warp struct of a regular grid of nodes, ``cell`` [m] apart; arrays over nodes are [z, y, x].
-    ``frequency`` is 1 / cell, ``period`` that of each axis [m], 0 or greater than two supports, and ``turn`` 1 / period
-    or 0. ``images`` is the number of periodic images of a particle, along each axis, whose support can reach nodes."""
+    """Return the Warp struct of a regular grid of nodes, ``cell`` [m] apart. Arrays over nodes are indexed [z, y, x].
+    ``period`` is the length of the periodic box along each axis [m], or 0."""
     real, vector = precision.real, precision.vector
     sizes, periods = {"cell": real, "frequency": real, "shape": wp.vec3i}, {"period": vector, "turn": vector}
     return struct_of("Nodes", precision, origin=vector, **sizes, periodic=wp.int32, **periods, images=wp.vec3i)
@@ -53,8 +51,8 @@ def nodes_type(precision: Precision) -> Any:
 
 @cache
 def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Return Warp functions ``place`` (position of a node [m]), ``nearest`` (vector to the nearest periodic image) and
-    ``image`` (position of a particle's image whose support can reach nodes)."""
+    """Return three Warp functions: ``place`` returns the position of a node [m], ``nearest`` the vector to the nearest
+    periodic image, and ``image`` the position of a periodic image of a particle."""
     real, vector = precision.real, precision.vector
     nodes_struct = nodes_type(precision)
 
@@ -71,8 +69,7 @@ def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
     @wp.func
     def image(number: int, x: vector, h: real, nodes: nodes_struct) -> vector:
-        """Return image ``number`` of x; image 0 is the lowest whose support h reaches the first node along every
-        axis."""
+        """Return the periodic image ``number`` of the position ``x``."""
         t = wp.cw_mul(x - nodes.origin + vector(h, h, h), nodes.turn)
         n_x = nodes.images[0]
         n_y = nodes.images[1]
@@ -89,7 +86,7 @@ def colours_type(precision: Precision, phases: int) -> Any:
 
 @cache
 def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
-    """Return kernels of particle colours: ``forward`` and ``tangent`` (which also sort), and ``adjoint``."""
+    """Return kernels of particle colours. ``forward`` and ``tangent`` also sort the particles."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
     module = kernel_module(f"phase_colour_{phases}_{precision.name}")
@@ -116,8 +113,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def phase_colour_adjoint(colours, c_scene, tint_scene_bar, c_scene_bar, colours_bar):
-        """Compute the adjoint of the mass fractions and, for each particle, its part of the adjoint of the phase
-        colours."""
+        """Compute the adjoints of the mass fractions, and the adjoint of the phase colours for each particle."""
         j = wp.tid()
         bar = tint_scene_bar[j]
         c_scene_bar[j] = colours[0] * bar
@@ -128,7 +124,8 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
 
 @cache
 def colour_field_kernels(discretisation: Discretisation) -> Kernels:
-    """Return kernels of the field: ``forward`` and ``tangent``, over nodes, ``adjoint``, over sorted particles."""
+    """Return the kernels of the colour field. ``forward`` and ``tangent`` have a thread for each node, and ``adjoint``
+    for each sorted particle."""
     precision = discretisation.precision
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct, grid_type = nodes_type(precision), cell_grid_type(precision)
@@ -146,7 +143,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     def row_sum(
         row: int, c_x: int, x_g, x: wp.array(dtype=vector), colour: wp.array(dtype=vector), nodes, grid, h, per_h, sigma
     ) -> rgba:
-        """Return a node's sum over the particles of cells c_x - 1, c_x and c_x + 1 of one row."""
+        """Return the sum at a node over the particles in three adjacent cells."""
         n = grid.shape[0]
         total = rgba()
         for o in range(below(n), above(n)):
@@ -198,7 +195,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.func
     def first_node(s: real, n: int) -> int:
-        """Return the first of n nodes that is not below s, in node distances."""
+        """Return the first of ``n`` nodes at or above the coordinate ``s``, in units of the node distance."""
         return int(wp.clamp(wp.ceil(s), real(0.0), real(n)))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -232,8 +229,8 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 def nodes_over(
     lower: np.ndarray, upper: np.ndarray, periods: np.ndarray, cell: float, support: float, precision: Precision
 ) -> Any:
-    """Return the struct of nodes ``cell`` [m] apart in a region (d,) to (d,) [m] and, along axes without a period, in
-    the margin that particles' supports reach. In 2-D there is one layer of nodes."""
+    """Return a grid of nodes with distance ``cell`` [m] over a region from ``lower`` to ``upper`` (d,) [m]. Axes that
+    are not periodic get a margin of the support radius. In 2-D there is one layer of nodes."""
     margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
@@ -254,10 +251,10 @@ def nodes_over(
 
 
 class ColourField:
-    """A map from a fixed number of particles to a field on a grid; `adjoint` overwrites its last result."""
+    """The colour field of a fixed number of particles. Each call of ``adjoint`` overwrites the previous result."""
 
     def __init__(self, of: Mapping[str, Any], precision: Precision, device: Any):
-        """Allocate for the particles and the region ``of`` the arguments of a `Renderer`."""
+        """Allocate the field. ``of`` has the arguments of a `Renderer`."""
         particles, phases, support, smoothing = (of[name] for name in ("particles", "phases", "support", "smoothing"))
         lower, upper, periods = (np.array(of[name]) for name in ("lower", "upper", "periods"))
         self._particles, self._device, self._precision = particles, device, precision
@@ -278,10 +275,10 @@ class ColourField:
         self.nodes = nodes_over(lower, upper, periods, of["cell"], support, precision)
         require(field_parts(prod(self.nodes.shape), precision.bytes), "take a larger cell", device)
         self.values = zeros(tuple(self.nodes.shape)[::-1], dtype=rgba_type(precision))
-        """(nz, ny, nx) colour times coverage, and coverage [-]."""
+        """Colour times coverage, and coverage, at the nodes (nz, ny, nx) [-]."""
 
     def gather(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> None:
-        """Compute the field from positions (n,) [m], mass fractions (n,) [-] and the phases' colours (phases, 3)."""
+        """Compute the field from positions (n,) [m], mass fractions (n,) [-] and the colours of phases (phases, 3)."""
         self._sort(positions)
         wp.copy(self._fractions, fractions)
         self._colours.assign(colours[None])
@@ -291,8 +288,8 @@ class ColourField:
         launch(self._field.forward, self.values.shape, self._device, self._kernel, own, given)
 
     def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
-        """Return the tangent (nz, ny, nx) of the last field, along tangents of positions (n,), fractions (n,) and
-        colours (phases, 3). A further call overwrites this result and that of `adjoint`."""
+        """Return the tangent (nz, ny, nx) of the last field along tangents of positions (n,), fractions (n,) and
+        colours (phases, 3). The next call of ``tangent`` or ``adjoint`` overwrites the result."""
         own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
         along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
         self._colours_dot.assign(colours_dot[None])
@@ -307,8 +304,8 @@ class ColourField:
         return wp.zeros_like(self.values)
 
     def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
-        """Return derivatives with respect to positions (n,), fractions (n,) and colours (phases, 3), given that with
-        respect to the field."""
+        """Return derivatives with respect to positions (n,), fractions (n,) and colours (phases, 3), given the
+        derivative with respect to the field."""
         own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
         bars = {"x_scene_bar": self._x_bar, "tint_scene_bar": self._colour_bar}
         bars |= {"c_scene_bar": self._fractions_bar, "colours_bar": self._colours_bar}

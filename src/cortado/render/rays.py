@@ -1,12 +1,11 @@
-"""Rays of a camera, and the interpolation of the colour field at samples on a ray.
+"""Rays of a camera, and interpolation of the colour field at samples on a ray.
 
-In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) run from -1 to 1 over the
-width of the picture, v upwards and in the same unit. At depth z the pixel (u, v) sees (w u, w v, -z), with the half
-width w = half_width + growth z. The formula holds for parallel rays (growth 0) and for rays from a point (half_width
-0).
+In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) are in units of half the
+width of the picture: u runs from -1 to 1, and v upwards. At depth z the pixel (u, v) sees the point (w u, w v, -z),
+with the half width w = half_width + growth z. For parallel rays growth is 0. For rays from one point half_width is 0.
 
-A sample is interpolated trilinearly between nodes; outside the grid the field is 0. The interpolated field is therefore
-continuous everywhere, and a field of one layer (2-D) is a sheet one node distance thick.
+The field at a sample is interpolated trilinearly between nodes, and is 0 outside the grid. It is therefore continuous.
+In 2-D, the field has one layer of nodes and appears as a sheet with the thickness of the node distance.
 """
 
 from functools import cache
@@ -20,9 +19,9 @@ from cortado.render.colour_field import nodes_type, rgba_type
 
 @cache
 def camera_type(precision: Precision) -> Any:
-    """Return the Warp struct of a camera: the columns of ``orientation`` point right, up and backwards; ``half_width``
-    [m] is seen at the camera, ``growth`` [-] is its growth with depth; samples begin at the distance ``near`` [m] along
-    a ray and are ``step`` apart [m]."""
+    """Return the Warp struct of a camera. The columns of ``orientation`` point right, up and backwards. ``half_width``
+    [m] is half the visible width at the camera, and ``growth`` [-] is its growth with depth. Samples along a ray begin
+    at the distance ``near`` [m] and are ``step`` [m] apart."""
     real, pixels = precision.real, {"columns": wp.int32, "rows": wp.int32}
     pose, widths = {"position": precision.vector, "orientation": precision.matrix}, {"half_width": real, "growth": real}
     ray = {"near": real, "step": real, "samples": wp.int32}
@@ -31,7 +30,6 @@ def camera_type(precision: Precision) -> Any:
 
 @cache
 def camera_tangent_type(precision: Precision) -> Any:
-    """Return the Warp struct of a view's change; see `cortado.render.cameras.ViewTangent`."""
     vectors = dict.fromkeys(("position", "turn"), precision.vector)
     numbers = dict.fromkeys(("half_width", "growth", "thickness"), precision.real)
     return struct_of("CameraTangent", precision, **vectors, **numbers)
@@ -39,15 +37,15 @@ def camera_tangent_type(precision: Precision) -> Any:
 
 @cache
 def ray_functions(precision: Precision) -> tuple[Any, ...]:
-    """Return Warp functions of a pixel's ray and its samples; ``samples_within`` returns the samples in a box,
-    ``pixels_before`` the pixels whose rays may hit it."""
+    """Return Warp functions of rays. ``samples_within`` returns the samples inside a box, and ``pixels_before`` the
+    pixels in front of a box."""
     real, vector = precision.real, precision.vector
     camera_struct, tangent_struct = camera_type(precision), camera_tangent_type(precision)
     tiny, huge = wp.constant(real(precision.tiny)), wp.constant(real(1.0 / precision.tiny))
 
     @wp.func
     def on_screen(pixel: int, c: camera_struct) -> vector:
-        """Return the screen point (u, v, 0) of a pixel's middle; row 0 is at the top."""
+        """Return the pixel coordinates (u, v, 0) of the middle of a pixel."""
         column = pixel % c.columns
         row = pixel // c.columns
         return vector(real(2 * column + 1 - c.columns), real(c.rows - 2 * row - 1), real(0.0)) / real(c.columns)
@@ -79,8 +77,7 @@ def ray_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def samples_within(o: vector, d: vector, lower: vector, upper: vector, c: camera_struct) -> wp.vec2i:
-        """Return the first sample in a box and the sample after the last. The range may contain one sample too many at
-        each end, never too few."""
+        """Return the first sample inside a box, and the last sample plus 1."""
         t_in = -huge
         t_out = huge
         for axis in range(3):
@@ -98,11 +95,8 @@ def ray_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def pixels_before(lower: vector, upper: vector, c: camera_struct) -> wp.vec4i:
-        """Return the range of columns and rows that may show a box: first and last + 1 of each, never too few.
-
-        If the box is in front of the camera, the extremes on the screen are at corners. If the box reaches behind
-        a perspective camera, it may cover any part of the screen, so all rows and columns are returned.
-        """
+        """Return the ranges of columns and rows that may show a box: the first column, the last column plus 1, the
+        first row, and the last row plus 1."""
         n_x = real(c.columns)
         n_y = real(c.rows)
         left = n_x
@@ -145,8 +139,7 @@ def ray_functions(precision: Precision) -> tuple[Any, ...]:
 
 @cache
 def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
-    """Return Warp functions ``value`` at a point, ``gradient`` (of bar . value), ``derivative`` (of the value, along a
-    direction) and ``trilinear_weight`` (of one node)."""
+    """Return Warp functions of the interpolated field: its value, its derivatives, and the weight of a node."""
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
 
@@ -163,7 +156,7 @@ def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def cell(x: vector, nodes: nodes_struct):
-        """Return the first node of a point's cell, and the point's offset from it, in node distances."""
+        """Return the first node of the cell around a point, and the point's offset from this node in node distances."""
         s = nodes.frequency * (x - nodes.origin)
         i = int(wp.floor(s[0]))
         j = int(wp.floor(s[1]))
@@ -184,7 +177,6 @@ def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def slope(f: vector, a: int, b: int, c: int) -> vector:
-        """Return the gradient of a corner's weight, per node distance."""
         return vector(
             real(2 * a - 1) * part(f[1], b) * part(f[2], c),
             real(2 * b - 1) * part(f[2], c) * part(f[0], a),
@@ -193,8 +185,7 @@ def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def gradient(x: vector, bar: rgba, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> vector:
-        """Return the gradient of bar . value. On the face between two cells, where it jumps, the gradient is that of
-        the upper cell."""
+        """Return the gradient at ``x`` of the dot product of ``bar`` and the interpolated value."""
         i, j, k, f = cell(x, nodes)
         total = vector()
         for a in range(2):
@@ -205,8 +196,7 @@ def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def derivative(x: vector, x_dot: vector, field: wp.array3d(dtype=rgba), nodes: nodes_struct) -> rgba:
-        """Return the derivative of the value at a moving point; on the face between two cells, the upper cell
-        counts."""
+        """Return the derivative of the interpolated value at ``x`` along ``x_dot``."""
         i, j, k, f = cell(x, nodes)
         total = rgba()
         for a in range(2):
@@ -217,7 +207,7 @@ def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def trilinear_weight(x: vector, x_g: vector, nodes: nodes_struct) -> real:
-        """Return the weight of the node at x_g in the value at x."""
+        """Return the weight of the node at ``x_g`` in the interpolated value at ``x``."""
         s = nodes.frequency * (x - x_g)
         w_x = wp.max(real(1.0) - wp.abs(s[0]), real(0.0))
         w_y = wp.max(real(1.0) - wp.abs(s[1]), real(0.0))

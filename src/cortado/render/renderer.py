@@ -1,4 +1,4 @@
-"""Rendering of particles with derivatives, and the renderer that a scene's table [render] describes."""
+"""Differentiable rendering of particles, and the renderer for the table [render] of a scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,28 +26,28 @@ from cortado.scene.tables import sentences
 
 @dataclass(frozen=True)
 class RenderAdjoint:
-    """The derivative of a function of the image. The next call of the renderer overwrites the Warp arrays."""
+    """Derivatives of a function of the image. The next call of the renderer overwrites the Warp arrays."""
 
     positions: wp.array
-    """With respect to positions, (n,) vectors [1 / m]."""
+    """Derivative with respect to positions, (n,) vectors [1 / m]."""
     fractions: wp.array
-    """With respect to mass fractions, (n,) vectors of one number for each phase [-]."""
+    """Derivative with respect to mass fractions, (n,) vectors with one component for each phase [-]."""
     colours: np.ndarray
-    """With respect to the phases' colours, (phases, 3) [-]."""
+    """Derivative with respect to the colours of the phases, (phases, 3) [-]."""
     translation: np.ndarray
-    """With respect to the camera's position, (3,) [1 / m]."""
+    """Derivative with respect to the position of the camera, (3,) [1 / m]."""
     rotation: np.ndarray
-    """With respect to a rotation vector of the camera about its position, (3,) [1 / rad]."""
+    """Derivative with respect to a rotation vector of the camera about its position, (3,) [1 / rad]."""
 
 
 @public
 @fixed
 class Renderer:
-    """Renders a fixed number of particles in one view, on one device; pictures are linear RGB.
+    """Renders a fixed number of particles in one view, on one device. Pictures are in linear RGB.
 
     Pictures are smooth functions of positions, fractions and colours, and piecewise smooth functions of the camera's
-    pose. If samples lie on faces between cells of the colour field, as in a view along an axis, the derivative with
-    respect to the pose is one-sided.
+    pose. In a view along an axis, samples may lie on faces between cells of the colour field. The derivative with
+    respect to the pose is then one-sided.
     """
 
     @WARP
@@ -69,13 +69,13 @@ class Renderer:
         periods: Sequence[float] | np.ndarray | None = None,
         colours: np.ndarray | None = None,
     ):
-        """Prepare a view of the fluid from ``lower`` to ``upper`` (d,) [m], plus a margin of the support radius [m].
+        """Prepare a view of fluid between ``lower`` and ``upper`` (d,) [m], with a margin of the support radius.
 
-        Along a periodic axis (``periods`` (d,) [m], 0 without a period) every periodic image of fluid between ``lower``
-        and ``upper`` is visible.
+        ``periods`` (d,) [m] are the lengths of the periodic box, 0 for an axis that is not periodic. Along a periodic
+        axis, every periodic image between ``lower`` and ``upper`` is visible.
 
-        ``volume`` is a particle's volume [m^d], ``cell`` the node distance [m], by default half the support radius.
-        ``colours`` (phases, 3) are the phases' default colours.
+        ``volume`` is the volume of a particle [m^d]. ``cell`` is the node distance [m], by default half the ``support``
+        radius. ``colours`` (phases, 3) are the default colours of the phases.
         """
         start_warp()
         for name, size in (("support", support), ("volume", volume), ("cell", 1.0 if cell is None else cell)):
@@ -113,16 +113,16 @@ class Renderer:
 
     @property
     def fingerprint(self) -> str:
-        """Text that identifies view and grid of nodes, for checkpoints."""
+        """Text that identifies the view and the grid of nodes, for checkpoints."""
         nodes = self._field.nodes
         return f"{self.view!r} {tuple(nodes.origin)} {nodes.cell} {tuple(nodes.shape)} {tuple(nodes.period)}"
 
     def in_precision(self, precision: Precision) -> "Renderer":
-        """Return a renderer of the same pictures in another precision."""
+        """Return a renderer with the same view in the given precision."""
         return Renderer(self.view, **self._settings, precision=precision)
 
     def seen_by(self, view: View) -> "Renderer":
-        """Return a renderer of the same particles in another view."""
+        """Return a renderer of the same particles with the given view."""
         return Renderer(view, **self._settings, precision=self._precision)
 
     @property
@@ -138,7 +138,7 @@ class Renderer:
 
     @property
     def device(self) -> Any:
-        """Device on which the renderer computes."""
+        """Device of the renderer."""
         return self._device
 
     @property
@@ -149,14 +149,14 @@ class Renderer:
 
     @WARP
     def render(self, positions: Any, fractions: Any = None, colours: Any = None) -> np.ndarray:
-        """Return the picture (rows, columns, 3), in float64, row 0 at the top: ``render(trajectory[-1])``.
+        """Return the picture (rows, columns, 3) in float64, with row 0 at the top: ``render(trajectory[-1])``.
 
         Args:
             positions: a frame such as ``trajectory[k]`` or ``problem.end(parameters)``, which includes mass fractions
             and perhaps colours; or (n, d) [m]; or a Warp array (n,) of vectors in the renderer's precision and on its
             device.
-            fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; may be left out with one phase.
-            colours: (phases, 3) colours of the phases; if left out, the renderer's own.
+            fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; not needed for a single phase.
+            colours: (phases, 3) colours of the phases; by default the renderer's colours.
         """
         positions, fractions, colours = self._completed(positions, fractions, colours)
         x = self._on_device("positions", positions, self._dimension, self._precision.vector)
@@ -171,8 +171,7 @@ class Renderer:
     def tangent(
         self, positions: Any = None, fractions: Any = None, colours: Any = None, view: ViewTangent | None = None
     ) -> np.ndarray:
-        """Return the derivative (rows, columns, 3) of the last picture along a direction; omitted parts of the
-        direction are 0.
+        """Return the derivative (rows, columns, 3) of the last picture along a direction. Omitted arguments are 0.
 
         Args:
             positions: (n, d) [m], the direction of the positions.
@@ -194,8 +193,8 @@ class Renderer:
 
     @WARP
     def adjoint(self, image_bar: np.ndarray) -> RenderAdjoint:
-        """Turn the derivative of a function with respect to the last picture (rows, columns, 3) into its derivatives
-        with respect to positions, mass fractions, colours and the camera's pose."""
+        """Return derivatives of a function of the last picture with respect to positions, mass fractions, colours and
+        the camera's pose. ``image_bar`` (rows, columns, 3) is the derivative with respect to the picture."""
         self._require_picture("adjoint")
         image_bar = _of_shape("image_bar", image_bar, self.shape)
         field_bar, pose = self._rays.adjoint(image_bar.reshape(-1, 3), self._field.values)
@@ -203,7 +202,7 @@ class Renderer:
 
     @WARP
     def field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return coverage (nx, ny, nz) and colour times coverage (nx, ny, nz, 3) [-] at the nodes of the last
+        """Return the coverage (nx, ny, nz) and the colour times coverage (nx, ny, nz, 3) at the nodes, for the last
         picture."""
         found = self._field.values.numpy().astype(np.float64).transpose(2, 1, 0, 3)
         return found[..., 3].copy(), found[..., :3].copy()
@@ -219,7 +218,6 @@ class Renderer:
             raise InputError(f"There is no picture to differentiate; call render before {method}.")
 
     def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
-        """Return the arguments of `render`, with a frame split into its fields and defaults filled in."""
         if hasattr(positions, "positions"):
             frame, positions = positions, positions.positions
             fractions = frame.mass_fractions if fractions is None else fractions
@@ -234,7 +232,6 @@ class Renderer:
         return positions, fractions, self._colours if colours is None else colours
 
     def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
-        """Return a Warp array (n,) of vectors: a checked Warp array, or one made from an array (n, components)."""
         if not isinstance(values, wp.array):
             array = _of_shape(name, values, (self._particles, components))
             if not np.isfinite(array).all():
@@ -259,19 +256,17 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 UP = {2: 2, 3: 1}
-"""Axis that points upwards, by dimension; in 2-D the one perpendicular to the plane."""
+"""Index of the upward axis by dimension. In 2-D this is the axis perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
-"""Node distance over particle spacing, by dimension. On coarser grids a particle's picture depends on its position
-between nodes, and optimisers can get stuck there."""
+"""Ratio of node distance to particle spacing, by dimension. With coarser grids optimisers can get stuck."""
 CLEARNESS = 8.0
-"""Width of the scene / depth of visibility in a "volume" view, unless the scene sets the extinction."""
+"""Ratio of the scene's width to the default depth of visibility in a "volume" view."""
 CAMERA = ("position", "look_at", "field_of_view", "extinction")
-"""Keys of the table [render] that are specific to one view."""
 
 
 def scene_renderer(simulation: Any, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """Make a renderer for the particles of a `cortado.Simulation` from its scene's table [render]; without the table, a
-    view from above.
+    """Make a renderer for the particles of a `cortado.Simulation` from the table [render] of its scene. The default is
+    a view from above.
 
     The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
     `Simulation.renderer`.
@@ -290,7 +285,6 @@ def scene_renderer(simulation: Any, extinction_factor: float = 1.0, **settings: 
 
 
 def _table(scene: Scene, settings: dict[str, Any]) -> Render:
-    """Return a scene's table [render] with some keys replaced; the camera's keys are dropped if the view changes."""
     given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
     view = settings.get("view")
     if isinstance(view, str) and view != given.get("view"):

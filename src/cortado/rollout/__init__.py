@@ -1,4 +1,4 @@
-"""Sequences of steps, forward and backward: states, checkpoints, and the transfer of parameters to a device."""
+"""Sequences of time steps, forward and backward."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Checkpoints of a forward run, the state at which a resumed run starts, and the error for a lost particle."""
+"""Checkpoints of a forward run, the progress of a resumed run, and the error for a lost particle."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,9 +18,11 @@ MEMORY_BUDGET = 8 * 2**30
 
 
 def checkpoint_interval(steps: int, affordable: int) -> int:
-    """Return the least interval between checkpoints [steps] for which at most ``affordable`` states are in memory:
-    checkpoints, and states recomputed between two checkpoints. If no interval suffices, return about the square root of
-    the steps."""
+    """Return the smallest number of steps between checkpoints that keeps at most ``affordable`` states in memory.
+
+    The stored states are the checkpoints, and the states between two checkpoints. If no interval suffices, return about
+    the square root of ``steps``.
+    """
     if steps <= affordable:
         return 1
     intervals = range(1, isqrt(steps) + 2)
@@ -28,7 +30,7 @@ def checkpoint_interval(steps: int, affordable: int) -> int:
 
 
 class Checkpoints:
-    """States of a forward run at every ``interval``-th step, from which a backward pass recomputes the others."""
+    """States of a forward run at every ``interval``-th step. A backward pass recomputes the states between them."""
 
     def __init__(self, first: State, interval: int):
         self._first, self._interval = first, interval
@@ -39,7 +41,7 @@ class Checkpoints:
         return len(self._states)
 
     def keep(self, step: int, chunk: list[State], series: StateSeries, length: int, spare: list[StateSeries]) -> None:
-        """Store every interval-th state of a chunk; a chunk of full ``length`` is copied to a ``spare`` series."""
+        """Store every ``interval``-th state of a chunk of steps."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
         if len(numbers) == length:
             copy = spare.pop() if spare else series.like()
@@ -53,7 +55,7 @@ class Checkpoints:
             self._states[n] = partial(_itself, state)
 
     def state(self, n: int, next_state: Callable[[int, State], State]) -> State:
-        """Return state ``n``, if needed recomputed by ``next_state(m, state m)``; call with decreasing ``n``."""
+        """Return state ``n``, recomputed by ``next_state(m, state m)`` if needed. Calls must have decreasing ``n``."""
         if n not in self._states:
             for m in range(n - n % self._interval, n):
                 self._states[m + 1] = partial(_itself, next_state(m, self._states[m]()))
@@ -62,7 +64,7 @@ class Checkpoints:
         return self._states[n]()
 
     def release(self) -> list[StateSeries]:
-        """Return the copies of complete chunks for reuse, which invalidates all checkpoints."""
+        """Return the stored arrays for reuse. All checkpoints become invalid."""
         copies, self._copies = self._copies, []
         return copies
 
@@ -73,17 +75,17 @@ def _itself(state: State) -> State:
 
 @dataclass(frozen=True)
 class Progress:
-    """The point at which an earlier process stopped a run; the resumed run has the bits of an uninterrupted run."""
+    """The point at which an earlier process stopped a run."""
 
     step: int = 0
     state: State | None = None
-    """State after the steps of the earlier process; None for the first state of the run."""
+    """Last state of the earlier process, or None if no step was taken."""
     diagnostics: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Diagnostics (step,) of the earlier steps by name."""
+    """Diagnostics (steps,) of the earlier steps, by name."""
 
     def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
-        """Return the state to resume at, its step number, and True if the run ends there. Raise `InputError` if
-        ``keep`` requires a backward pass through unknown states."""
+        """Return the first state of the resumed run, its step number, and True if the run ends there. Raises
+        `InputError` if ``keep`` is true after steps of an earlier process."""
         if self.state is None:
             return initial, 0, False
         if keep:
@@ -91,7 +93,6 @@ class Progress:
         return self.state, self.step, sizes.go_on(self.step, self.state, self.diagnostics.get("time_steps"))
 
     def whole(self, found: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Prepend the diagnostics of the earlier process to those ``found``."""
         if self.state is None:
             return dict(found)
         n = self.step
@@ -99,26 +100,27 @@ class Progress:
 
 
 class Beside(Protocol):
-    """Protocol of launches that are captured together with the steps of a chunk."""
+    """Protocol of additional kernel launches after each step of a chunk."""
 
     def launch(self, step: int, parameters: Parameters) -> None:
-        """Launch kernels that read the solver's arrays after a step of a chunk, counted from 0."""
+        """Launch kernels that read the solver's arrays after a step of a chunk. The first ``step`` is 0."""
 
 
 class ChunkReader(Protocol):
-    """Protocol of readers of states on the device, chunk by chunk."""
+    """Protocol of objects that read the states of a chunk on the device."""
 
     @property
     def beside(self) -> Beside | None:
-        """Return launches for each step, or None."""
+        """Return the kernel launches after each step, or None."""
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
-        """Read the states before steps ``step`` to ``end``: ``first``, and those of ``later``, which the next chunk
-        overwrites."""
+        """Read the states before the steps from ``step`` to ``end``: the state ``first``, and the states of ``later``.
+        The next chunk overwrites the states."""
 
 
 def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
-    """Return the error for a lost particle of a ``member``, given at least two states up to the failed step."""
+    """Return the error for a lost particle of scene ``member``. ``known`` are two or more states up to the
+    failed step."""
     containment, particles = solver.containment, solver.layout.particles
     spacing, d = containment.walled.spacing, containment.walled.dimension
     own = slice(member * particles, (member + 1) * particles)

@@ -1,4 +1,4 @@
-"""States of steps, derivatives with respect to states, and parameters over time, as NumPy arrays or on the device."""
+"""States, derivatives and parameters of time steps, as NumPy arrays or on the device."""
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,11 +25,12 @@ from cortado.scene.parameters import Axis, Role
 from cortado.scene.restart import RestartState
 
 OfLost = Mapping[int, float]
-"""Value of the derivatives of lost scenes by number: 0 if all given derivatives are 0, else NaN."""
+"""Derivative for each lost scene: 0 or NaN, by scene number."""
 
 
 def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Parameters | None = None) -> OfLost:
-    """Return 0 for each lost scene whose given derivatives of state, time (batch,) and parameters are 0, else NaN."""
+    """Return the derivative for each lost scene: 0 if all given derivatives of the scene are 0, and NaN for any other
+    lost scene."""
     found = {}
     for b in rollout.lost:
         own = [array.numpy() for array in given.member(b).arrays()]
@@ -46,26 +47,26 @@ def without_lost(lost: OfLost, found: Arrays) -> Arrays:
 
 
 States = RestartState | tuple[RestartState, ...]
-"""A restart state, or a tuple of those of all scenes of a batch."""
+"""A restart state, or a tuple with a restart state for each scene of a batch."""
 Given = RestartState | Sequence[RestartState] | None
-"""A restart state, or a sequence of those of all scenes of a batch; None for the scene's first state."""
+"""A restart state, or a sequence with a restart state for each scene of a batch. None is the scene's first state."""
 
 
 class HostStates:
-    """The interface of steps to states on the host: restart states, and derivatives as float64 NumPy arrays."""
+    """Converts between states on the host and device states."""
 
     def __init__(self, simulation: Simulated):
         self._simulation = simulation
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
-        """Set the first state and checked parameters of a rollout; raise `InputError` for a state of another
+        """Set the first state and the parameters of a rollout. Raises `InputError` for a state of a different
         simulation."""
         states = one_for_each(state, self._simulation.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, varied, states)
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Any:
-        """Return the state of a rollout after ``steps`` steps as read-only restart states, NaN for lost scenes."""
+        """Return the state of a rollout after ``steps`` steps as read-only restart states. Lost scenes get NaN."""
         found = self.states(state, scenes_after(rollout, steps), rollout.lost)
         self._simulation.judged_states.update(found)
         return found[0] if self._simulation.batch is None else found
@@ -73,8 +74,8 @@ class HostStates:
     def states(
         self, state: State, scenes: Sequence[RestartState], lost: Container[int] = ()
     ) -> tuple[RestartState, ...]:
-        """Copy a device state to read-only restart states with clocks and origins of ``scenes``, NaN for ``lost``
-        scenes."""
+        """Copy a device state to read-only restart states, with NaN for ``lost`` scenes. The clocks and origins are
+        copied from ``scenes``."""
         fields, batch = state.numpy(self._simulation.dimension), self._simulation.batch
         found = []
         for b, scene in enumerate(scenes):
@@ -87,8 +88,8 @@ class HostStates:
         return tuple(found)
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """Write derivatives by field name to a device state, 0 for missing fields; return the derivative of the time.
-        Raise `InputError` for unsuitable arrays."""
+        """Write derivatives by field name to a device state, and return the derivative with respect to time. Missing
+        fields are 0. Raises `InputError` for arrays of wrong shape or type."""
         fields, shapes = require_fields(what, given, to), shapes_of_fields(self._simulation, to.batch)
         arrays = {name: as_numbers(f"{what} {name}", value) for name, value in fields.items()}
         for name, array in arrays.items():
@@ -108,13 +109,13 @@ class HostStates:
                 raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Return derivatives by field name in float64, with values of ``lost`` for lost scenes."""
+        """Return derivatives by field name in float64. The derivatives of lost scenes are in ``lost``."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(lost, found)
 
 
 def require_fields(what: str, given: Values, state: State) -> Values:
-    """Return a table of derivatives by field name without the time; raise `InputError` for other names and types."""
+    """Return the derivatives by field name without ``time``. Raises `InputError` for unknown names or wrong types."""
     if not isinstance(given, Mapping):
         raise InputError(f"{what} is {shown(given)}, but must be a table of arrays by name, {{'positions': ...}}.")
     known = (*state.names, STATE_TIME)
@@ -125,7 +126,7 @@ def require_fields(what: str, given: Values, state: State) -> Values:
 
 
 def time_of(what: str, given: Values, state: State) -> np.ndarray:
-    """Return the derivative with respect to a state's time, () or (batch,), from a table; by default 0."""
+    """Return the derivative with respect to the time of a state, () or (batch,). It is 0 if missing."""
     members = () if state.batch is None else (state.batch,)
     found = as_numbers(f"{what} {STATE_TIME}", given.get(STATE_TIME, np.zeros(members)))
     if found.shape != members:
@@ -134,8 +135,7 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
 
 
 def scenes_after(rollout: Rollout, steps: int) -> list[RestartState]:
-    """Return each scene's clock and origin after ``steps`` steps of a rollout, as restart states without fields; scenes
-    with the same clock and origin share one."""
+    """Return restart states without fields that have each scene's clock and origin after ``steps`` steps."""
     made, found = dict[tuple[int, float, int], RestartState](), []
     for clock, size, origin in zip(rollout.clocks, rollout.time_steps.tolist(), rollout.origins, strict=True):
         key = id(clock), size, id(origin)
@@ -147,19 +147,21 @@ def scenes_after(rollout: Rollout, steps: int) -> list[RestartState]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceState:
-    """A state, or the states of all scenes of a batch, in arrays on the device, from `Simulation.on_device` or steps.
+    """A state in arrays on the device, or the states of all scenes of a batch. `Simulation.on_device` returns a
+    `DeviceState`, and so do steps from a `DeviceState`.
 
-    ``state["positions"]`` is a read-only Warp array whose memory ``torch.from_dlpack`` and ``jax.dlpack.from_dlpack``
-    share. Arrays have the precision of the simulation, and vectors have three components in 2-D too.
+    ``state["positions"]`` is a read-only Warp array. ``torch.from_dlpack`` and ``jax.dlpack.from_dlpack`` share its
+    memory. Arrays have the precision of the simulation. Vectors have three components in 2-D, too.
     """
 
     arrays: State
     """All fields of the state, on the device."""
     scenes: tuple[RestartState, ...]
-    """Clock and origin of each scene of a batch, as restart states without fields."""
+    """Clock and origin of each scene, as restart states without fields."""
 
     def __getitem__(self, name: str) -> wp.array:
-        """Return a field by name: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...)."""
+        """Return a field by name: (n, 3) for vectors, (n, phases) for fractions, (n,) for numbers. For a batch, the
+        first axis counts the scenes."""
         if name not in self.arrays.names:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.arrays.names)}.")
         return self.arrays.numbers(name)
@@ -173,7 +175,7 @@ class DeviceState:
 
 
 class DeviceStates(HostStates):
-    """The interface of steps to states on the device: a `DeviceState`, and derivatives as DLPack arrays."""
+    """Converts between states on the device (`DeviceState`, DLPack arrays) and the states of a rollout."""
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Any, values: Arrays, varied: set[str]) -> None:
         self._require_taken(state)
@@ -181,7 +183,7 @@ class DeviceStates(HostStates):
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:
-        """Set only the first state of a rollout, from a `DeviceState`."""
+        """Set the first state of a rollout from a `DeviceState`."""
         self._require_taken(state)
         rollout.begin_evaluation()
         rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
@@ -189,8 +191,7 @@ class DeviceStates(HostStates):
         rollout.step_sizes.begin_at(rollout.initial)
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> DeviceState:
-        """Copy the state of a rollout after ``steps`` steps to a `DeviceState`, which shares constant arrays with the
-        `DeviceState` at which the rollout has ``begun``."""
+        """Copy the state of a rollout after ``steps`` steps to a `DeviceState`."""
         scenes = scenes_after(rollout, steps)
         self._simulation.judged_states.update(scenes)
         shares = isinstance(begun, DeviceState) and not rollout.lost
@@ -204,12 +205,11 @@ class DeviceStates(HostStates):
         return time_of(what, given, to)
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Return copies of derivatives by field name, in the simulation's precision."""
         own = _without_lost(lost, state.copy())
         return {name: own.numbers(name) for name in own.names}
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
-        """Overwrite ``fields`` of a device state, and check the result on the host."""
+        """Replace ``fields`` of a device state, and check the result on the host."""
         given = require_fields("state", fields, state.arrays)
         copy_to(state.arrays, "state", given)
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
@@ -222,7 +222,6 @@ class DeviceStates(HostStates):
         return state
 
     def on_host(self, state: DeviceState) -> States:
-        """Copy a device state to read-only restart states."""
         self._require_own(state)
         found = self.states(state.arrays, state.scenes)
         judged = zip(found, state.scenes, strict=True)
@@ -249,7 +248,7 @@ class DeviceStates(HostStates):
 
 
 def copy_to(state: State, what: str, given: Mapping[str, Any]) -> None:
-    """Copy DLPack arrays to fields of a state; raise `InputError` for another shape, type or device."""
+    """Copy DLPack arrays to fields of a state. Raises `InputError` for a wrong shape, type or device."""
     for name, value in given.items():
         own, array = state.numbers(name), _taken(f"{what} {name}", value)
         if (array.device, array.dtype, array.shape) != (own.device, own.dtype, own.shape):
@@ -259,7 +258,6 @@ def copy_to(state: State, what: str, given: Mapping[str, Any]) -> None:
 
 
 def _taken(what: str, value: Any) -> wp.array:
-    """Convert a DLPack array to a Warp array in the same memory; raise `InputError`."""
     if isinstance(value, wp.array):
         return value
     if not hasattr(value, "__dlpack__"):
@@ -278,16 +276,18 @@ def _without_lost(lost: OfLost, state: State) -> State:
 
 
 class DeviceRows:
-    """Parameters over time on the device, as Warp arrays in the simulation's precision, with numbers of shape (1,).
-    Values are not checked: they may be infinite, and a solid may move too far in a step."""
+    """Parameters over time as Warp arrays on the device, in the simulation's precision. Numbers have shape (1,).
+
+    Values are not checked. They may be infinite, and a solid may move too far in a time step.
+    """
 
     def __init__(self, simulation: Simulated, space: ParameterSpace):
         self._simulation, self._space = simulation, space
         self._spread, self._fold = _kernels(simulation.precision)
 
     def split(self, given: Values | None, what: str = "parameter") -> tuple[Values, dict[str, wp.array]]:
-        """Split parameters by name into values for the host, and Warp arrays that stay on the device; raise
-        `InputError` for an array of another shape, type or device."""
+        """Split parameters by name into values for the host and Warp arrays on the device. Raises `InputError` for an
+        array of wrong shape, type or device."""
         if not isinstance(given, Mapping):
             return {} if given is None else given, {}
         rows = {name: array for name, array in given.items() if isinstance(array, wp.array) and self.takes(name)}
@@ -301,7 +301,6 @@ class DeviceRows:
         return {name: value for name, value in given.items() if name not in rows}, rows
 
     def takes(self, name: str) -> bool:
-        """Test if a parameter may stay on the device: steps of fixed length use its rows unchanged."""
         parameter = None if self._simulation.scene.solver.chooses else self._simulation.known.get(name)
         return parameter is not None and parameter.axis is Axis.STEP and parameter.role is Role.RUN
 
@@ -316,7 +315,7 @@ class DeviceRows:
             parameters.set({name: own})
 
     def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
-        """Sum the adjoints ``found`` of a rollout's parameters over scenes and steps that share a row."""
+        """Sum the adjoints ``found`` over all scenes and time steps with the same value."""
         adjoints = {}
         for name, array in rows.items():
             bars, shape = _numbers(found[name]), self._in_three(name, array).shape
@@ -332,7 +331,7 @@ class DeviceRows:
         return sums
 
     def _in_three(self, name: str, array: wp.array) -> wp.array:
-        """Reshape rows to (members, steps, k), with length 1 for an axis along which all share a row."""
+        """Reshape a parameter to (members, steps, k). Constant axes have length 1."""
         each = prod(self._space.shapes(name)[0])
         of_each = array.ndim == self._simulation.known[name].rank + 2  # otherwise all scenes share the rows
         members = len(array) if of_each else 1
@@ -340,13 +339,11 @@ class DeviceRows:
 
 
 def _numbers(array: wp.array) -> wp.array:
-    """View vectors or numbers (members, steps) as numbers (members, steps, k)."""
     return components(array, (*array.shape, wp.types.type_size(array.dtype)))
 
 
 @cache
 def _kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels: ``spread`` copies rows to all scenes and steps, and its transpose ``fold`` sums adjoints."""
     real = precision.real
     module = kernel_module(f"device_rows_{precision.name}")
 

@@ -1,4 +1,4 @@
-"""Warnings about a run: unconverged pressure, divergence, a dry emitter, lost scenes."""
+"""Warnings about a run: unconverged pressure, divergent flow, an empty emitter, lost scenes."""
 
 from collections.abc import Iterator, Mapping
 
@@ -12,11 +12,10 @@ from cortado.scene.scene import Scene
 from cortado.sph.viscous_solve import Solve
 
 TORN = 0.015
-"""Greatest divergence, times the step, without a warning; stable flows reach 0.014."""
+"""Divergence of the velocity times the time step, above which a step counts towards a warning."""
 
 
 def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
-    """Yield warnings on the last forward run of a rollout: pressure, divergence, a dry emitter, lost scenes."""
     noted = rollout.diagnostics
     converged = noted["converged"]
     if not converged.all():
@@ -40,7 +39,7 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
-    """Return a warning with the number of steps whose pressure did not converge, and advice."""
+    """Return a warning with the number of steps in which the pressure did not converge, and advice."""
     advice = "try a smaller time step, more iterations or a larger tolerance."
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
@@ -53,8 +52,8 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
 
 
 def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> str | None:
-    """Return a warning on the step with the greatest divergence after the projection, or None if at most 5 % of the
-    steps exceed `TORN`."""
+    """Return a warning about the step with the greatest divergence of the velocity, or None if few steps
+    exceed `TORN`."""
     found = diagnostics.get("divergence", np.zeros(0))
     if not (found > TORN).any():
         return None
@@ -71,7 +70,7 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
-    """Return a warning on the first emitter that runs out of fluid before the end of the run, or None."""
+    """Return a warning about the first emitter that runs out of fluid before the end of the run, or None."""
     spacing, clock = scene.discretisation.spacing, rollout.clocks[0]
     taken = rollout.taken if scene.solver.chooses else rollout.steps
     times = clock.times(np.arange(taken + 1), float(rollout.time_steps.max()))

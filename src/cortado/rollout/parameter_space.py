@@ -1,4 +1,4 @@
-"""Parameters by name: checks, and the conversion to the arrays of a rollout and back; the number of steps of a run."""
+"""Checks parameters, converts them to the arrays of a rollout, and determines the number of steps of a run."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
@@ -32,18 +32,17 @@ from cortado.scene.scene_warnings import viscosity_sentence
 from cortado.scene.stability import divergence_advice
 
 SAME = 1e-9
-"""Relative tolerance within which a time counts as reached."""
+"""Relative tolerance of times."""
 STATE_TIME = "time"
-"""Name of the time of a state in tables of derivatives by field."""
 _VARIED = frozenset({"mobility", "viscosity"})
-"""Parameters for which `ParameterSpace.begin` depends on ``varied``."""
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
-"""Parameters that determine the number of explicit diffusion substeps."""
 
 
 class ParameterSpace:
-    """The map from parameters by name to the arrays of a rollout, and back to gradients. In a batch, values are for all
-    scenes, or have a first axis for the scenes."""
+    """Converts parameters by name to the arrays of a rollout, and adjoints of the arrays to gradients.
+
+    In a batch, a value applies to all scenes, or it has a first axis for the scenes.
+    """
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._batch, self._steps = simulation, simulation.batch, steps
@@ -53,13 +52,12 @@ class ParameterSpace:
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
-        """The last rollout that began, with evaluation, values, and names of varied parameters."""
         self._judged: Arrays | None = None
         self._strongest: tuple[Arrays, float] | None = None
-        """Values of the last check of stability limits, except gravity, and the strongest gravity [m/s2] so far."""
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
-        """Return values as float64 arrays; raise `InputError`. Values of a "direction" may be negative."""
+        """Return values as float64 arrays. Raises `InputError` for invalid values. With ``what`` "direction", negative
+        values are valid."""
         if not isinstance(values, Mapping):
             raise InputError(f"{what}s are {shown(values)}, but must be a table by name, such as {{'gravity': value}}.")
         for view, name in self._known.views.items():
@@ -86,7 +84,6 @@ class ParameterSpace:
         return found
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
-        """Return the shapes that a parameter may have; raise `InputError` for an unknown parameter."""
         check_known(name, self._simulation.scene, known=self._known)
         own = self._one.shapes(name)
         return [*own, *self._batched(own)]
@@ -96,12 +93,12 @@ class ParameterSpace:
         return different if len(different) > 1 else different * (self._batch or 1)
 
     def defaults(self) -> Arrays:
-        """Return the scene's values of all parameters, with a row for each step of scheduled parameters."""
+        """Return the scene's values of all parameters. Parameters over time have a first axis for the steps."""
         found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
         return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
 
     def depends_on_time(self, values: Arrays) -> bool:
-        """Test if parameters outside ``values``, or lengths of steps, depend on a state's clock."""
+        """Test if the time steps or the scheduled parameters depend on the time of the state."""
         courses = self._one.courses(values).values()
         still = [isinstance(course, Steady) and course.greatest() == 0.0 for course in courses]
         return self._simulation.scene.solver.chooses or not all(still)
@@ -118,10 +115,9 @@ class ParameterSpace:
         states: Sequence[RestartState] = (),
         write: Callable[[State], None] | None = None,
     ) -> None:
-        """Set the first state and the parameters of a rollout to ``values``, or by default to the scene's values.
+        """Set the first state and the parameters of a rollout. ``values`` replace the scene's values.
 
-        ``varied``: parameters whose derivatives are needed; with the mobility, a substep of diffusion is taken even if
-        the mobility is 0. ``states`` replace the scene's first state, with fields by ``write`` if given.
+        ``varied`` are the parameters with wanted derivatives. ``states`` replace the scene's first state.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if write is not None and self._goes_on(rollout, values, varied, states):
@@ -204,7 +200,7 @@ class ParameterSpace:
 
     @cached_property
     def _is_still(self) -> bool:
-        """Return True if the scene has no scheduled parameters, emitters or moving solids."""
+        """Test if the scene has no scheduled parameters, no emitters and no moving solids."""
         scene = self._simulation.scene
         return not (self.depends_on_time({}) or scene.emitter or any(table.moves for table in scene.solid))
 
@@ -214,7 +210,7 @@ class ParameterSpace:
             warn(sentence)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
-        """Raise `InputError` unless restart states of all scenes suit this simulation and ``values``."""
+        """Raise `InputError` unless the restart states of all scenes fit this simulation and ``values``."""
         for name in self._known.state if states else ():
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
@@ -225,8 +221,8 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """Return tangents of the first state and of the parameters for a direction ``along`` by name, at ``values``.
-        The next call for this rollout overwrites the tangents of the parameters, so that captured graphs stay valid."""
+        """Return tangents of the first state and of the parameters along a direction. ``along`` maps names of
+        parameters to tangents. The next call overwrites the tangents of the parameters."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]
@@ -243,8 +239,11 @@ class ParameterSpace:
         parameters: Parameters,
         time_dots: np.ndarray | None = None,
     ) -> None:
-        """Write a direction ``along`` by name to the tangents ``dot`` of the first state, unless it was given, and
-        ``parameters``. ``time_dots``: tangents (members,) of the first states' times."""
+        """Write a direction to the tangents ``dot`` of the first state and to the tangents ``parameters``. ``along``
+        maps names of parameters to tangents.
+
+        ``time_dots`` (members,) are tangents of the times of the first states.
+        """
         members, times = self.members(values), np.zeros(len(rollout.clocks)) if time_dots is None else time_dots
         each = zip(members, self.members(along), rollout.clocks, times, strict=True)
         directions = [self._one.direction(*own) for own in each]
@@ -253,14 +252,14 @@ class ParameterSpace:
         parameters.set(stacked([run for _, run in directions]))
 
     def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
-        """Return the adjoints (members,) of the first states' times, given the adjoints of the parameters."""
+        """Return the adjoints (members,) of the times of the first states, given the adjoints of the parameters."""
         run = self._read(parameters, {name for own in self._different(values) for name in self._one.changing(own)})
         members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
         return np.array([self._one.time_adjoint(own, entry(run, b), clock) for b, (own, clock) in members])
 
     def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
-        """Return the adjoint of the first state as float64 arrays by field name, with ``time``; in a batch with a first
-        axis for the scenes."""
+        """Return the adjoint of the first state, including ``time``, as float64 arrays by field name. For a batch, each
+        array has a first axis for the scenes."""
         found = {name: bar.astype(np.float64) for name, bar in state.numpy(self._simulation.dimension).items()}
         times = self.time_adjoints(rollout, values, parameters)
         return {**found, STATE_TIME: times[0] if self._batch is None else times}
@@ -268,8 +267,8 @@ class ParameterSpace:
     def gradient(
         self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters, elsewhere: Collection[str] = ()
     ) -> Arrays:
-        """Return the gradient with respect to ``values``, given adjoints of the first ``state`` and the parameters. In
-        a batch, arrays have a first axis for the scenes. Names in ``elsewhere`` are left out."""
+        """Return the gradient with respect to ``values``, given adjoints of the first ``state`` and of the parameters.
+        For a batch, each array has a first axis for the scenes. Parameters in ``elsewhere`` are omitted."""
         dimension = self._simulation.dimension
         read = {self._known.views.get(name, name) for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
@@ -301,8 +300,6 @@ class ParameterSpace:
         return array
 
     def _batched(self, own: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
-        """Return the shapes in a batch of a parameter with shapes ``own`` in a scene; parameters over time always have
-        an axis of steps."""
         if self._batch is None:
             return []
         if len(own) == 1:
@@ -313,7 +310,6 @@ class ParameterSpace:
         return value.shape if value.shape in self._one.shapes(name) else value.shape[1:]
 
     def _different(self, values: Arrays) -> list[Arrays]:
-        """Return a table of values for each scene of a batch, or a single table if the scenes share all values."""
         shared, each = {}, {}
         for name, value in values.items():
             own = self._one.shapes(name)
@@ -327,8 +323,8 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Check the values of a scene; raise `InputError`. Warn of time steps beyond limits of stability, and of
-        crowded first positions."""
+        """Raise `InputError` for invalid values of a scene. Warn if time steps exceed limits of stability, or if first
+        positions are too close together."""
         simulation = self._simulation
         if self._steps == 0:
             return
@@ -347,8 +343,6 @@ class ParameterSpace:
             warn(sentence)
 
     def _is_stronger(self, values: Arrays) -> bool:
-        """Test if values may exceed stability limits that the last values met; False if only gravity changed and is
-        not stronger."""
         others = {name: np.zeros(0) if name == "gravity" else value.copy() for name, value in values.items()}
         strength = float(np.linalg.norm(np.atleast_2d(values["gravity"]), axis=1).max()) if "gravity" in values else 0.0
         last, self._strongest = self._strongest, (others, strength)
@@ -364,8 +358,8 @@ class ParameterSpace:
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
-    """Return the number of steps of a run, given directly or by a time [s]; with adaptive steps an upper bound. Raise
-    `InputError` unless exactly one of both is given and valid."""
+    """Return the number of steps of a run, from either ``steps`` or ``time`` [s]. With adaptive steps it is an upper
+    bound. Raises `InputError` unless exactly one of ``steps`` and ``time`` is given."""
     if steps is None and time is None:
         raise InputError("steps is left out, but must be given, as no time is given.")
     if steps is not None and time is not None:
@@ -391,6 +385,6 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
 
 
 def end_after(rollout: Rollout, time: float | None) -> None:
-    """End a rollout with adaptive steps with the first state at least ``time`` [s] after its start."""
+    """End a rollout with adaptive steps at the first state that is at least ``time`` [s] after its start."""
     if time is not None and isinstance(rollout.step_sizes, ChosenSteps):
         rollout.step_sizes.end_after(time * (1.0 - SAME))

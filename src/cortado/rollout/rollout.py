@@ -1,8 +1,8 @@
 """The time loop: forward runs, checkpoints and backward passes.
 
-Steps are launched in chunks without host reads. After a chunk, the host checks for lost particles, and repeats the
-chunk if neighbour lists were too short. A chunk of steps, or a step of reverse or forward mode, is a captured graph on
-a GPU, and on a CPU if launches use one thread.
+Steps are launched in chunks. After a chunk, the host checks for lost particles, and repeats the chunk if neighbour
+lists were too short. On a GPU, a chunk of forward steps is a captured graph, and so is one step of forward or reverse
+mode. Graphs are also used on a CPU if launches use one thread.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,36 +35,36 @@ from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepLog, StepTangent
 
 Observer = Callable[[int, State], None]
-"""Function of a state's number and the state, which later steps overwrite."""
+"""Function that is called with the number of a state and the state. Copy the state to keep it, because later steps
+overwrite it."""
 OBSERVED = "a number of steps", "a state"
-"""Descriptions of an observer's two arguments, for error messages."""
 CHUNK = {"cpu": 8, "cuda": 64}
-"""Greatest number of steps between two reads by the host."""
+"""Greatest number of steps in a chunk, by kind of device."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Particles times steps of a chunk above which a read by the host costs almost nothing."""
+"""Number of particles times steps in a chunk above which longer chunks are not faster."""
 
 
 class BackwardStep(Protocol):
-    """Protocol of the backward pass through a step, made by an `AdjointEstimator` for a rollout."""
+    """Protocol of the backward pass through one step, made by an `AdjointEstimator`."""
 
     capturable: bool
-    """True if a backward step may be captured as a CUDA graph."""
+    """True if the backward step may be captured as a CUDA graph."""
     rollout: "Rollout"
     solver: Solver
-    """Solver whose fields contain the replayed step after `step`."""
+    """Solver that repeats the forward step."""
 
     def begin(self) -> None:
-        """Set the adjoints of the parameters to 0, before a new backward pass."""
+        """Set the adjoints of the parameters to 0."""
 
     def step(self, state: State, counts: Counts, bar: State) -> None:
-        """Replace ``bar``, the adjoint of a step's result, by the adjoint of the ``state`` before the step."""
+        """Replace ``bar``, the adjoint of the state after a step, by the adjoint of ``state`` before the step."""
 
     def parameters(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""
 
 
 class AdjointStep:
-    """The exact `BackwardStep`, which repeats a step and propagates the adjoint through the step in reverse."""
+    """The exact `BackwardStep`: it repeats a step and then computes the adjoint."""
 
     capturable = True
 
@@ -85,8 +85,8 @@ class AdjointStep:
 
 
 class Rollout(Staying):
-    """Steps of a solver from a first state, which can be repeated and differentiated. Between evaluations ``steps`` may
-    be set to any number up to ``room``, the number at construction."""
+    """Steps of a solver from a first state, which can be repeated and differentiated. ``steps`` may be changed between
+    evaluations, up to ``room``."""
 
     instead = "but the simulation that it is of can"
 
@@ -98,52 +98,46 @@ class Rollout(Staying):
         self.initial = solver.new_state()
         self.parameters = solver.new_parameters(steps)
         self.substeps = 0
-        """Explicit steps of diffusion within each step."""
+        """Number of diffusion substeps in each step."""
         self.time_steps = np.zeros(solver.layout.members)
-        """Time steps (members,) [s] before rounding to the device's precision."""
+        """Time steps (members,) [s] in double precision."""
         self.advice: Callable[[int], str] = lambda member: "try a smaller time step, or more pressure iterations"
         self.clocks = [Clock()] * solver.layout.members
         self.origins: list[Origin] = []
         self.lost: dict[int, DivergedError] = {}
-        """Errors of scenes of a batch that lost a particle in the last forward run; their later states are invalid."""
+        """Errors of the scenes of a batch that lost a particle in the last forward run."""
         self.log = solver.new_log(steps)
         self.step_sizes = StepSizes()
-        """Lengths of the steps; for adaptive steps a `ParameterSpace` replaces this object."""
+        """Lengths of the time steps."""
         self.progress = Progress()
-        """Start of forward runs of the present evaluation."""
         self.taken = 0
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
         self._checkpoints = Checkpoints(self.initial, self._interval)
         self._spare: list[StateSeries] = []
-        """Unused series of earlier runs, for the next run with checkpoints."""
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         self._input = self._buffer
-        """State before a chunk: the first state, if all steps are in one chunk."""
         kind = "cpu" if self._device.is_cpu else "cuda"
         length = max(min(CHUNK[kind], FILLED[kind] // max(solver.layout.all_particles, 1), steps), 1)
         self._series = StateSeries(self.initial, length)
         self._chunk = [self._series.state(k) for k in range(length)]
         self._tangent: tuple[Parameters, StepTangent, State] | None = None
-        """Tangents of the parameters, the tangent step made for them, and the tangent of the present state."""
         self._generation = -1
         self._forget_stale_graphs()
         self.copies: list[State] = []
         self.beside: dict[tuple[str, ...], Beside] = {}
         self.longest_chunk = length
         self.goes_on = False
-        """True if the first state depends on no parameter."""
         self.evaluation = 0
-        """Number of the present evaluation (first state and parameters)."""
+        """Number of the current evaluation. It increases with every new first state and with new parameters."""
         self._evaluations = count(1)
         self.pending: WeakSet[Residual] = WeakSet()
         self.aside: list[tuple[State, StepLog]] = []
         self._kept = self._run = -1
-        """Evaluations of the present checkpoints, and of the last run."""
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics of the last forward run: (steps,) by name, in a batch (steps, batch); see `StepLog`."""
+        """Diagnostics of the last forward run by name, (steps,), or (steps, batch) for a batch. See `StepLog`."""
         found = self.log.diagnostics
         return self.progress.whole({**found, **self.step_sizes.diagnostics(len(found["converged"]))})
 
@@ -155,7 +149,7 @@ class Rollout(Staying):
         return self.solver.turn
 
     def begin_evaluation(self) -> None:
-        """Prepare for a new first state and parameters; pending residuals save copies of the present ones."""
+        """Prepare for a new first state and new parameters. Residuals in use first copy the current values."""
         if len(self.pending) > 1:
             self._checkpoints.release()  # several residuals share them, so they must not be reused
         for pending in list(self.pending):
@@ -173,11 +167,12 @@ class Rollout(Staying):
         meanwhile: Callable[[], None] | None = None,
         reader: ChunkReader | None = None,
     ) -> State:
-        """Run to the last step or the end time; return the last state, which the next run overwrites.
+        """Run to the last step or the end time, and return the last state. The next run overwrites the state.
 
-        ``observe``: called with every state; ``keep``: store checkpoints for a backward pass; ``meanwhile``: called
-        while a GPU computes; ``reader``: reads states on the device. Raise `DivergedError` after the valid states were
-        observed; a batch continues without scenes that have ``lost`` a particle."""
+        ``observe`` is called with every state. ``keep`` stores checkpoints for a backward pass. ``meanwhile`` is called
+        while a GPU computes. ``reader`` reads states on the device. Raises `DivergedError` if a particle is lost, after
+        ``observe`` was called with all valid states. A batch continues without the scenes in ``lost``.
+        """
         self._kept = self._run = -1
         self._spare += self._checkpoints.release()
         self._checkpoints = Checkpoints(self.initial, self._interval)
@@ -230,8 +225,6 @@ class Rollout(Staying):
         return state
 
     def _advance(self, first: int, last: int, reader: ChunkReader | None) -> list[State]:
-        """Take steps ``first`` to ``last`` from the input state; return their states, which the next chunk
-        overwrites."""
         length, beside = last - first, None if reader is None else reader.beside
         if self._device.is_cuda and beside not in self._warm:
             self._warm_up(first, beside)
@@ -247,13 +240,12 @@ class Rollout(Staying):
         return self._chunk[:length]
 
     def _length(self, left: int) -> int:
-        """Return the number of steps of the next chunk, at most ``left``. The last chunks of a rollout shorter than
-        its room are powers of two, so that runs of other lengths reuse graphs."""
+        """Return the number of steps of the next chunk."""
         length = min(len(self._chunk), self.step_sizes.longest_chunk, left)
         return length if self.steps == self.room or length < left else 1 << (length.bit_length() - 1)
 
     def _warm_up(self, first: int, beside: Beside | None) -> None:
-        """Take a step and undo it, because captures must not load modules or allocate memory."""
+        """Take a step and undo it, because a graph capture must not load modules or allocate memory."""
         self._begin_at(first)
         self._take(1, beside)
         is_short = self.solver.make_room()
@@ -277,17 +269,16 @@ class Rollout(Staying):
             return
         self._generation, self._warm = self.solver.generation, set[Beside | None]()
         self._chunks: dict[tuple[int, Beside | None, bool], CapturedGraph] = {}
-        """Graphs by number of steps, launches beside them, and True if they begin with the buffer."""
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
-        """Return the adjoint of the first state, given adjoints ``bars`` of states by number. The next backward pass
+        """Return the adjoint of the first state. ``bars`` are adjoints of states by number. The next backward pass
         overwrites the result.
 
-        ``observe``: called with the adjoint of every state, from the last to the first. Raise `InputError` unless
-        `forward` has run to the end with this first state and these parameters, and with ``keep``.
+        ``observe`` is called with the adjoint of every state, from the last to the first. Raises `InputError` unless
+        ``forward`` has run to the end with ``keep``, the current first state and the current parameters.
         """
         if derivative.rollout is not self:
             raise InputError("The derivative was made for another rollout, but must be made for this one.")
@@ -326,8 +317,8 @@ class Rollout(Staying):
 
     @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
-        """Replace ``dot``, the tangent of the first state, by the tangent of the last state; ``observe``: called with
-        the tangent of every state. Raise `InputError` unless `forward` has run with these parameters."""
+        """Replace ``dot``, the tangent of the first state, by the tangent of the last state. ``observe`` is called with
+        the tangent of every state. Raises `InputError` unless ``forward`` has run with the current parameters."""
         self._require("along a tangent", self._run)
         self.solver.set_substeps(self.substeps)
         self._forget_stale_graphs()
@@ -363,7 +354,7 @@ class Rollout(Staying):
         return new_state
 
     def _seek(self, step: int) -> Counts:
-        """Prepare the solver to repeat a step, counted from 0; return the recorded counts."""
+        """Prepare the solver to repeat a step, and return the recorded iteration counts. The first ``step`` is 0."""
         self._begin_at(step)
         return self.log.seek(step)
 
@@ -377,9 +368,9 @@ REPLACED = *OF_RUNS, "clocks", "origins", "substeps", "advice", "goes_on", "eval
 
 
 class Residual:
-    """A handle on an evaluation of a rollout, which allows a backward pass after later evaluations.
+    """The data of an evaluation of a rollout, for a backward pass after later evaluations.
 
-    The residual copies the first state, parameters and log when the next evaluation begins.
+    Before the next evaluation begins, the first state, the parameters and the log are copied to the residual.
     """
 
     def __init__(self, rollout: Rollout):
@@ -392,7 +383,6 @@ class Residual:
         return self.rollout.turn
 
     def put_aside(self) -> None:
-        """Copy the first state, parameters and log before another evaluation overwrites them."""
         rollout = self.rollout
         made = rollout.aside.pop() if rollout.aside else (rollout.initial.like(), rollout.solver.new_log(rollout.room))
         first, log = made

@@ -1,4 +1,4 @@
-"""Checks of a run's input: parameters, first positions, paths of solids, and restart states."""
+"""Checks of the input of a run: parameters, first positions, paths of solids, and restart states."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import chain
@@ -28,7 +28,7 @@ from cortado.scene.stability import broken_limits
 
 
 def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
-    """Raise `OutOfRangeError` for numbers too large for the precision, or too small where they must be positive."""
+    """Raise `OutOfRangeError` for numbers that the precision cannot represent."""
     for name, value in values.items():
         size = np.abs(value)
         if size.max(initial=0.0) > precision.greatest:
@@ -40,7 +40,7 @@ def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Raise `InputError` if one of the first ``free`` particles, or an emitter's opening, is outside the container."""
+    """Raise `InputError` if an emitter's opening or one of the first ``free`` particles is outside the container."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -74,8 +74,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
-    """Return a warning about the tightest exceeded stability limit that is not in ``told``, or None; add all exceeded
-    limits to ``told``."""
+    """Return a warning about the strictest exceeded stability limit, or None. Limits in ``told`` are ignored, and
+    exceeded limits are added to ``told``."""
     if scene.solver.time_step == "auto":
         return None
     time_step = float(values.get("time_step", scene.solver.time_step))
@@ -89,7 +89,7 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
-    """Return the indices of points (n, d) [m] outside a room."""
+    """Return the indices of points (n, d) [m] outside the container."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
@@ -99,8 +99,8 @@ class FirstPositions:
         self._judged: dict[int, NDArray] = {}
 
     def check(self, values: Arrays, member: int) -> str | None:
-        """Return a warning if first positions are crowded, or None; raise `InputError` if two particles coincide, or
-        would burst apart."""
+        """Return a warning if first positions are too close together, or None. Raises `InputError` if two particles
+        coincide or would fly apart."""
         simulation = self._simulation
         positions = values.get("initial_positions", simulation.positions)
         spacing = simulation.scene.discretisation.spacing
@@ -125,21 +125,22 @@ class FirstPositions:
 
 
 FURTHEST = 1.0
-"""Greatest distance [spacings] that a solid may move in a step without passing over fluid."""
+"""Greatest displacement of a solid in a time step [spacings]. Faster solids could pass over fluid."""
 SCALES = (0.6, 1.5)
-"""Least and greatest scale of a solid whose wall particles hold fluid."""
+"""Smallest and greatest scale of a solid with wall particles. Beyond these scales, fluid leaks."""
 
 
 def path_sentence(
     scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
 ) -> str | None:
-    """Return a sentence on the first faulty path or scale of a solid or nozzle, or None; ``run``: arrays for steps."""
+    """Return a sentence about the first invalid path or scale of a solid or nozzle, or None. ``run`` has the values of
+    all time steps."""
     leaps = _leaps(scene, values, courses) if scene.solver.chooses else ()
     return next(chain(_stretches(scene, values), leaps, _jumps(scene, first, run, courses)), None)
 
 
 def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Yield sentences on paths that move more than a spacing within the shortest step that may be chosen."""
+    """Yield sentences on paths that move more than a spacing even in the shortest time step."""
     spacing = scene.discretisation.spacing
     for what, moved in moved_by(scene, values, courses).items():
         travel = Travel.of(scene, values, [moved])
@@ -153,8 +154,8 @@ def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Ite
 
 
 def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Yield sentences on solids that move more than a spacing in a step, in the first scene of a batch. With adaptive
-    steps, solids with a course are not checked."""
+    """Yield sentences on solids that move more than a spacing in a time step. Only the first scene of a batch is
+    checked."""
     spacing = scene.discretisation.spacing
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
@@ -172,7 +173,7 @@ def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changi
 
 
 def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
-    """Yield sentences on solids whose scale is too far from 1, overlaps fluid, or leaves a gap in a period."""
+    """Yield sentences on solids with an invalid scale."""
     spacing, periods = scene.discretisation.spacing, scene.periods[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
@@ -192,13 +193,12 @@ def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
 
 
 SAME = 1e-6
-"""Relative difference between equal numbers of which one may have been rounded to float32."""
+"""Relative tolerance for equal numbers, also after rounding to float32."""
 MIXED = 0.02
-"""Relative tolerance of the volume of particles whose phases have diffused, and of the sum of their fractions."""
+"""Relative tolerance for the volume of mixed particles, and for the sum of their mass fractions."""
 
 
 def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
-    """Return the origin of particles with rest densities (phases,) [kg/m3]."""
     scene, cut = simulation.scene, simulation.scene.discretisation
     return Origin(
         spacing=cut.spacing,
@@ -212,7 +212,8 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
 
 
 def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
-    """Return a list of restart states for all scenes, empty for None; raise `InputError` for another number or type."""
+    """Return a list with a restart state for each scene, or an empty list for None. Raises `InputError` for a wrong
+    number or type."""
     if state is None:
         return []
     states = list(state) if isinstance(state, Sequence) and not isinstance(state, str) else [state]
@@ -231,15 +232,15 @@ def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) ->
 
 
 def shapes_of_fields(simulation: Simulated, batch: int | None = None) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a state's fields by name, with a first axis of length ``batch`` unless None."""
+    """Return the shapes of a state's fields by name. A ``batch`` adds a first axis for the scenes."""
     sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
     members = () if batch is None else (batch,)
     return {field.name: (*members, *field.shape(*sizes)) for field in simulation.initial.fields}
 
 
 def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> None:
-    """Raise `InputError` unless a restart state suits the simulation and the ``origin`` of its particles. Only the
-    origin is compared for states in `Simulated.judged_states`; lost scenes of a batch are not checked."""
+    """Raise `InputError` unless a restart state matches the simulation and the ``origin`` of its particles. For states
+    in `Simulated.judged_states` only the origin is compared."""
     if state.origin is not None and state in simulation.judged_states:
         _check_origin(state.origin, origin)
         return
@@ -331,8 +332,7 @@ def _listed(value: object) -> str:
 
 
 def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:
-    """Raise `InputError` unless reference densities (n,) match the rest densities, for a single phase particle by
-    particle, for several phases by total volume."""
+    """Raise `InputError` unless reference densities (n,) match the rest densities."""
     if (found <= 0.0).any():
         raise InputError("state reference_density must be greater than 0.")
     volumes = found * (fractions / rest_density).sum(axis=1)
@@ -349,8 +349,7 @@ def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) 
 
 
 def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
-    """Raise `InputError` unless half of the particles (n, d) of a state are at least 0.7 spacings from the nearest
-    neighbour, and a tenth at most 1.4 spacings."""
+    """Raise `InputError` if the distances of particles (n, d) do not match the spacing."""
     if len(positions) < 2 or not simulation.scene.forces.pressure:
         return
     spacing = simulation.scene.discretisation.spacing

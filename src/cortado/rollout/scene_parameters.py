@@ -1,4 +1,4 @@
-"""The conversion from the named parameters of a scene to the NumPy arrays of a run, and back."""
+"""Converts the named parameters of a scene to the NumPy arrays of a run, and back."""
 
 from typing import Protocol
 from weakref import WeakSet
@@ -27,42 +27,39 @@ from cortado.solvers.build import ForceMaker
 from cortado.solvers.solver import Solver
 
 DENSITY = "reference_density"
-"""Name of the state field that the first mass fractions and the rest densities determine."""
+"""Name of the state field with the reference density."""
 COMPOSITION = ("mass_fractions", "rest_density")
 
 
 class Simulated(Source, Protocol):
-    """Protocol of simulations for `SceneParameters` and `cortado.rollout.parameter_space`."""
-
     initial: State
-    """First state, on the device."""
     known: Known
     forces: tuple[ForceMaker, ...]
     judged_states: WeakSet[RestartState]
-    """Restart states that need no further check."""
+    """Restart states that have already been checked."""
     batch: int | None
-    """Number of scenes in a batch; None for a single scene."""
+    """Number of scenes in a batch, or None for a single scene."""
     solver: Solver
     precision: Precision
     smoothing: SmoothingKernel
     lattice: Lattice
-    """Constants of the lattice of particles at rest."""
+    """Constants of the rest lattice."""
     free_particles: int
-    """Number of particles that do not wait in an emitter, the first ones."""
+    """Number of particles outside emitters. They come first."""
 
     @property
     def dimension(self) -> int: ...
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver in sentences, if it adds fields to states; else None."""
+        """Name of the solver if the solver adds fields to states, or None."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
-        """Return the stable number of explicit diffusion substeps per time step."""
+        """Return the number of diffusion substeps that is stable for each time step."""
 
 
 class SceneParameters:
-    """The map from a scene's parameters by name to the arrays of a run, with tangents and adjoints."""
+    """Converts the parameters of a scene by name to the arrays of a run, with tangents and adjoints."""
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps, self._known = simulation, steps, simulation.known
@@ -78,7 +75,7 @@ class SceneParameters:
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
     def courses(self, values: Arrays) -> dict[str, Changing]:
-        """Return the courses of parameters that are not among ``values``; gravity or tilt replaces both courses."""
+        """Return the scheduled parameters that are not replaced in ``values``, as functions of time."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._scheduled, **self._known.courses}
         found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
@@ -89,16 +86,17 @@ class SceneParameters:
         return {name: known.views[name] for name in values if name in known.views and known[known.views[name]].grows}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
-        """Return the times (steps,) [s] at which a scheduled parameter is evaluated."""
+        """Return the times (steps,) [s] for the values of a scheduled parameter."""
         time_step = float(values.get("time_step", self.values["time_step"]))
         return (clock or Clock()).times(self._moments(name), time_step)
 
     def _moments(self, name: str) -> NDArray:
-        """Return the times (steps,), in steps, at which a scheduled parameter is evaluated."""
+        """Return the times (steps,) for the values of a scheduled parameter, in units of time steps."""
         return np.arange(max(self._steps, 1)) + self._known[name].moment
 
     def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
-        """Return the derivatives (steps, ...) of `scheduled` with respect to the time step, or to the clock's time."""
+        """Return the derivatives (steps, ...) of the scheduled parameters with respect to the time step, or to the time
+        of the clock."""
         found = {}
         for name, course in self.courses(values).items():
             times, moments = self._times(name, values, clock), self._moments(name)
@@ -111,20 +109,20 @@ class SceneParameters:
         return found
 
     def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
-        """Return the scheduled parameters (steps, ...) that are not among ``values``, with gravity for a scheduled
-        tilt."""
+        """Return the values (steps, ...) of the scheduled parameters that are not replaced in ``values``. A scheduled
+        tilt is returned as gravity."""
         rows = {name: course.at(self._times(name, values, clock)) for name, course in self.courses(values).items()}
         return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
 
     def scheduled_at(self, values: Arrays, time: float, size: float) -> Arrays:
-        """Return the scheduled parameters of a step at ``time`` [s] with length ``size`` [s]."""
+        """Return the scheduled parameters for a time step of length ``size`` [s] at ``time`` [s]."""
         courses = self.courses(values)
         rows = {name: course.at(np.array([time + self._known[name].moment * size])) for name, course in courses.items()}
         return {name: value[0] for name, value in self.upright(rows).items() if name in self._known.run}
 
     def run(self, values: Arrays) -> Arrays:
-        """Return the arrays for steps, from upright ``values`` or the scene's: parameters over time (steps, ...),
-        parameters of phases (phases,), others unchanged."""
+        """Return the parameters of all time steps. ``values`` replace the scene's values. Parameters over time have the
+        shape (steps, ...), parameters of phases (phases,)."""
         known = self._known
         found = {name: values.get(name, self.values[name]) for name in known.run}
         for name, value in found.items():
@@ -136,8 +134,8 @@ class SceneParameters:
         return found
 
     def first(self, values: Arrays) -> Arrays:
-        """Return the fields of the first state that depend on ``values``; raise `InputError` for mass fractions without
-        volume."""
+        """Return the fields of the first state that depend on ``values``. Raises `InputError` for mass fractions
+        without volume."""
         fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields
@@ -155,8 +153,8 @@ class SceneParameters:
     def direction(
         self, values: Arrays, along: Arrays, clock: Clock | None = None, time_dot: float = 0.0
     ) -> tuple[Arrays, Arrays]:
-        """Convert a direction ``along`` by name to tangents of the first state's fields, and of the arrays for steps;
-        ``time_dot``: tangent of the clock's time."""
+        """Return tangents of the first state's fields and of the parameters of all time steps. ``along`` maps names of
+        parameters to tangents, and ``time_dot`` is the tangent of the clock's time."""
         for view, replaced in self._known.views.items():
             for name, other in ((view, replaced), (replaced, view)):
                 if name in along and other in values:
@@ -189,13 +187,13 @@ class SceneParameters:
         return {"gravity" if name == "tilt" else name for name in self.courses(values)}
 
     def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
-        """Return the adjoint of the clock's time, given adjoints ``run`` of the arrays for steps."""
+        """Return the adjoint of the clock's time, given the adjoints ``run`` of the parameters of all time steps."""
         rates = self._scheduled_rates(values, clock, of_clock=True)
         return sum((float((run[name] * rate).sum()) for name, rate in rates.items()), 0.0)
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
-        """Return the gradient with respect to ``values``, given adjoints ``run`` of the arrays for steps, and ``first``
-        of the first state's fields. Names missing in ``run`` are left out."""
+        """Return the gradient with respect to ``values``. ``first`` are the adjoints of the first state's fields, and
+        ``run`` the adjoints of the parameters of all time steps. Parameters without an adjoint are omitted."""
         found = {name: run[name].copy() for name in self._known.run if name in values and name in run}
         for field in self._simulation.initial.fields:
             if field.first in values and field.name in first:

@@ -1,5 +1,8 @@
-"""Bounds on the time steps of a run at any speed of the fluid (limits of the scene, scheduled gravity, motion along
-paths), and the number of steps of a run."""
+"""Bounds on the time steps of a run, and the expected number of steps.
+
+The bounds do not depend on the speed of the fluid. They follow from the scene, scheduled gravity and the paths of
+emitters and solids.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,17 +28,19 @@ from cortado.scene.solvers import COURANT
 from cortado.scene.stability import SOLID_STEP, chosen_limits, gravity_limits, stability_limits
 
 ROOM = 4
-"""Safety factor on the expected number of steps."""
+"""Safety factor for the expected number of steps."""
 MOST = 1e17
-"""Greatest number of steps of a run given by its time."""
+"""Greatest number of steps of a run that ends at a given time."""
 LEAST = 1e-4
-"""Shortest step that a path may cause, relative to the greatest step; a faster path counts as a jump."""
+"""Shortest time step for a fast path, relative to the longest time step."""
 Moved = Sequence[tuple[float, Changing | None]]
-"""Courses of an object, with factors from the course's rate to a speed: 1, or an arm [m] for a turn."""
+"""Pairs of a factor and a function of time for a moving object. The factor is 1 for a position, or the distance from
+the axis [m] for a rotation."""
 
 
 def greatest_step(scene: SceneTables, values: Arrays) -> float:
-    """Return the longest step [s] of a run at any gravity; raise `InputError` without any bound."""
+    """Return the longest possible time step [s] for any gravity. Raises `InputError` if nothing limits the
+    time step."""
     found = min(chosen_limits(scene, values).values())
     if not np.isfinite(found):
         raise InputError(
@@ -46,8 +51,8 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
 
 
 def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0.0) -> NDArray:
-    """Return upper bounds (steps,) [s] of the steps, also by rows of gravity in ``values``. Raise `InputError` for a
-    bound below the ``least`` [s] of the precision."""
+    """Return upper bounds of the time steps (steps,) [s], for the gravity of each step in ``values``. Raises
+    `InputError` for a bound below ``least`` [s]."""
     bounds = np.full(max(steps, 1), greatest_step(scene, values))
     if "gravity" in values:
         limits = gravity_limits(scene, np.atleast_2d(values["gravity"])).values()
@@ -62,7 +67,7 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
 
 
 def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> dict[str, Moved]:
-    """Return the courses of each emitter and solid, by a phrase such as "the emitter 'tap'"."""
+    """Return the paths of each emitter and solid. The keys are phrases such as "the emitter 'tap'"."""
     names = [emitter.name for emitter in scene.emitter]
     found: dict[str, Moved] = {f"the emitter {name!r}": [(1.0, courses.get(path_name(name)))] for name in names}
     for solid in told(scene.solid):
@@ -73,18 +78,17 @@ def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> d
 
 @dataclass(frozen=True, eq=False)
 class Travel:
-    """The distance that the fastest point on several paths covers, a piecewise linear function of time."""
+    """The distance that the fastest moving object covers, as a piecewise linear function of time."""
 
     times: NDArray[np.float64]
-    """Times (k,) [s] of changes of speed, from 0 on."""
+    """Times of changes of the speed (k,) [s], beginning with 0."""
     speeds: NDArray[np.float64]
-    """Speeds (k,) [m/s] after each of the times; 0 after the last."""
+    """Speeds after each time (k,) [m/s]."""
     lengths: NDArray[np.float64]
-    """Distances (k,) [m] covered at each of the times."""
+    """Distances covered before each time (k,) [m]."""
     furthest: float
-    """Greatest distance in a step [m]."""
+    """Greatest displacement of an object in a time step [m]."""
     least: float
-    """Least length [s] to which paths shorten steps."""
 
     @classmethod
     def of(cls, scene: Scene, values: Arrays, moved: Iterable[Moved]) -> "Travel":
@@ -96,7 +100,7 @@ class Travel:
         return cls(times, speeds, lengths, furthest, LEAST * greatest_step(scene, values))
 
     def longest(self, time: float) -> float:
-        """Return the longest step [s] that may begin at a time [s]; infinite after the end of the paths."""
+        """Return the longest allowed time step [s] from ``time`` [s] on. It is infinite after the end of all paths."""
         reached = float(self.at(time)) + self.furthest
         k = int(np.searchsorted(self.lengths, reached, side="right")) - 1
         if self.speeds[k] == 0.0:
@@ -109,8 +113,8 @@ class Travel:
         return np.asarray(np.interp(np.asarray(times), self.times, self.lengths))
 
     def steps(self, duration: float, longest: float) -> float:
-        """Return an upper bound on further steps in ``duration`` [s], beside steps of length ``longest`` [s], for the
-        distance, and for steps that grow back after paths slow down."""
+        """Return an upper bound on the number of additional time steps for the paths in ``duration`` [s]. Without
+        paths, time steps have the length ``longest`` [s]."""
         begins = np.concatenate([self.times, self.times - duration])
         way = float((self.at(begins + duration) - self.at(begins)).max())
         with np.errstate(divide="ignore"):
@@ -121,17 +125,16 @@ class Travel:
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """The bound on steps by gravity or a tilt that changes over time."""
+    """The bound on time steps by scheduled gravity or tilt."""
 
     scene: Scene
     course: Knots
     upright: Callable[[NDArray], NDArray]
-    """Function that turns k values of the scheduled gravity or tilt into vectors of gravity, (k, d) [m/s2]."""
+    """Function that converts values of gravity or tilt to vectors of gravity (k, d) [m/s2]."""
     greatest: float
-    """Greatest length of a step [s]."""
 
     def longest(self, time: float) -> float:
-        """Return the longest step [s] that may begin at a time [s], before gravity becomes too strong."""
+        """Return the longest time step [s] that stays within the bound of gravity from ``time`` [s] on."""
         ways = np.linspace(0.0, self.greatest, 9)
         known = self.course.breaks - time
         ways = np.concatenate([ways, known[(known > 0.0) & (known < self.greatest)]])
@@ -140,7 +143,7 @@ class Pull:
 
 
 def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Travel | Pull]:
-    """Return the bounds on steps by speed along paths and by scheduled gravity, with a phrase as name."""
+    """Return the bounds on time steps from paths and from scheduled gravity. The keys are phrases for messages."""
     courses, greatest = parameters.courses(values), greatest_step(scene, values)
     upright: dict[str, Any] = {"gravity": np.asarray, "tilt": Tilt(scene.forces.gravity).gravity}
     pulls = {name: one for name, one in courses.items() if name in upright and isinstance(one, Knots)}
@@ -150,8 +153,8 @@ def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) 
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Make a rollout choose its steps, after clocks and first states were set; ``members``: upright values of all
-    scenes."""
+    """Make a rollout use adaptive time steps. Set the clocks and first states before. ``members`` are the values of
+    each scene."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius
@@ -164,7 +167,7 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
 
 
 class Courses:
-    """The `Scheduled` of a batch: bounds on steps, and rows of scheduled parameters, at the time of each scene."""
+    """Bounds on time steps and values of scheduled parameters at the current time of each scene."""
 
     def __init__(self, rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]):
         self._rollout, self._parameters, self._members = rollout, parameters, members
@@ -181,8 +184,8 @@ class Courses:
 
 
 def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
-    """Estimate the number of steps of a run over a time [s] in which fluid always falls through the container, plus
-    steps for paths. Raise `InputError` above `MOST` steps."""
+    """Estimate the number of time steps of a run over ``time`` [s]. The estimated fluid speed is the speed after a fall
+    through the container. Raises `InputError` above `MOST` steps."""
     scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
     limits = stability_limits(scene, values)
@@ -194,24 +197,24 @@ def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
 
 
 def counted_steps(time: float, steps: float) -> int:
-    """Return a number of steps rounded up, at least 1; raise `InputError` above `MOST`."""
+    """Round a number of steps up to a whole number of at least 1. Raises `InputError` above `MOST`."""
     if steps > MOST:
         raise InputError(f"time is {time:g} s, but must be less, as that takes about {steps:.2g} steps.")
     return max(ceil(steps), 1)
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
-    """Return the greatest expected number of frames of a run with a frame every ``record_every`` steps."""
+    """Return an upper estimate of the number of frames of a run with a frame every ``record_every`` steps."""
     return 2 + rollout.steps // (ROOM if ends_at_a_time(rollout) else 1) // record_every
 
 
 def ends_at_a_time(rollout: Rollout) -> bool:
-    """Test if a rollout ends at a time, not after a known number of steps."""
+    """Test if a rollout ends at a given time instead of after a given number of steps."""
     return bool(np.isfinite(rollout.step_sizes.end))
 
 
 def done_of(rollout: Rollout, step: int, time: float) -> int:
-    """Return a rollout's progress after a step, at a time [s]: the step, or the percentage of a given end time."""
+    """Return the progress of a rollout: the number of steps, or a percentage for a run with a given end time."""
     if not ends_at_a_time(rollout):
         return step
     begun, end = rollout.clocks[0].time, rollout.step_sizes.end

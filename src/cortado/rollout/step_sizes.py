@@ -1,8 +1,8 @@
-"""Lengths of a rollout's steps: fixed, or chosen on the device before each step, recorded, and reused for repeats.
+"""Lengths of the time steps of a rollout, which are fixed or chosen on the device before each step.
 
-An adaptive step of the projection is retaken with a shorter length if it compresses fluid or loses a particle, as
-between facing walls that are closer than a spacing. The step keeps its length if a shorter step does not help. Only the
-state before a step decides, so that a resumed run has the steps of an uninterrupted run.
+An adaptive step of the projection solver is repeated with a shorter length if it compresses fluid or loses a particle.
+The step keeps its length if a shorter step does not help. The choice depends only on the state before a step. A resumed
+run therefore has the same steps as a run without interruption.
 """
 
 from collections.abc import Sequence
@@ -24,21 +24,20 @@ from cortado.solvers.projection.steps import ProjectionSteps
 from cortado.solvers.solver import Solver
 
 PRESSED = 0.2
-"""Greatest compression, as a fraction of the density, that a step may add to a particle without being retaken."""
+"""Greatest accepted increase of the compression of a particle in a step, relative to the density."""
 SHORTER = 0.25
-"""Factor by which a retaken step is shortened."""
+"""Length of a repeated step, relative to its previous length."""
 
 
 @dataclass(frozen=True)
 class Try:
     size: float
-    """Length of the step [s]."""
     added: float
-    """Greatest compression that the step added to a particle; infinite if a particle was lost."""
+    """Greatest increase of the compression of a particle, or infinity for a lost particle."""
 
 
 class Retaken:
-    """The steps of a run that were retaken with a shorter length."""
+    """The repeated steps of a run."""
 
     def __init__(self) -> None:
         self._tries: dict[tuple[int, int], tuple[float, list[Try]]] = {}
@@ -47,9 +46,12 @@ class Retaken:
     def found(
         self, first: int, added: NDArray, sizes: NDArray, longest: NDArray, lost: dict[int, int]
     ) -> dict[tuple[int, int], float]:
-        """Return new lengths [s] by (step, scene) for the first step of each scene to retake. Arrays (steps, members):
-        ``added`` compression, ``sizes`` [s], and ``longest`` lengths [s] that states allow. ``lost``: number of the
-        step in which a scene lost a particle."""
+        """Return the first step to repeat in each scene, as new lengths [s] by (step, scene).
+
+        Arrays have the shape (steps, members). ``added`` is the increase of compression, ``sizes`` are the lengths of
+        the steps [s], and ``longest`` are the allowed lengths [s]. ``lost`` maps the number of a scene to the step that
+        lost a particle.
+        """
         again = {}
         for member in range(added.shape[1]):
             end = lost.get(member, first + len(added))
@@ -63,7 +65,6 @@ class Retaken:
         return again
 
     def _next(self, key: tuple[int, int], now: Try, least: float) -> float | None:
-        """Return the next length [s], at least ``least``, of a failed step; None if the step keeps its length."""
         least, tries = self._tries.setdefault(key, (least, []))
         tries.append(now)
         helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= 0.5 * tries[-2].added
@@ -76,7 +77,7 @@ class Retaken:
 
 
 class Compressions:
-    """The greatest compression that each step of a run adds to a particle, recorded on the device."""
+    """Records on the device the greatest increase of a particle's compression in each step."""
 
     def __init__(self, solver: ProjectionSteps, steps: int):
         layout, device = solver.layout, solver.device
@@ -86,7 +87,7 @@ class Compressions:
         self._added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
 
     def measure(self, state: State) -> None:
-        """Record the compression added by the step before ``state``; kernel launches only."""
+        """Record the increase of compression in the step before ``state``."""
         solver, members = self._solver, self._solver.layout.members
         numbers = {"particles": solver.layout.particles, "first_waiting": solver.system.waiting}
         now = {"order": solver.search.order, "n": solver.fields["n"], "x": state.positions}
@@ -96,13 +97,12 @@ class Compressions:
         solver.launch(self._record, greatest, added=self._added, threads=members)
 
     def read(self, first: int, last: int) -> NDArray[np.float64]:
-        """Return the added compressions (last - first, members) [-] of steps ``first`` to ``last``."""
+        """Return the increase of compression (last - first, members) [-] in the steps from ``first`` to ``last``."""
         return np.asarray(self._added[first:last].numpy(), dtype=np.float64)
 
 
 @cache
 def compression_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels without derivatives: added compression of each particle, and its maximum in each scene."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"compressions_{precision.name}")
     typed = TypesByName(real, {pair: "added greatest", vector: "x", wp.int32: "order step"})
@@ -110,8 +110,8 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def compare(particles: int, first_waiting: int, order, n, excess, x_free, x, added):
-        """Write to ``added`` a pair (0, growth of compression) per sorted particle. Compression is (n - 1)+, at the
-        last repair and before the step. Particles in a nozzle, perhaps inside walls, add 0."""
+        """Write the increase of compression of each sorted particle. The compression is max(n - 1, 0) with the number
+        density n."""
         i = wp.tid()
         more = wp.max(excess[i], real(0.0)) - wp.max(n[i] - real(1.0), real(0.0))
         p = order[i]
@@ -132,58 +132,57 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 GROWTH = 1.1
-"""Greatest ratio of the lengths of two successive steps."""
+"""Greatest ratio of successive time steps."""
 LEAST = 1e-6
-"""Least length to which the fluid's speed shortens a step, as a fraction of the other bounds."""
+"""Shortest time step for fast fluid, relative to the bound without fluid."""
 
 
 class Scheduled(Protocol):
-    """Protocol of scheduled parameters of all scenes of a batch, as functions of time."""
-
     def longest(self, times: NDArray) -> NDArray:
-        """Return the longest steps (members,) [s] that may begin at times (members,) [s]."""
+        """Return the longest allowed time steps (members,) [s] from ``times`` (members,) [s] on."""
 
     def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        """Write the scheduled parameters of a step with times and lengths (members,) [s]."""
+        """Write the scheduled parameters of a time step at ``times`` (members,) [s] with the lengths ``sizes``
+        (members,) [s]."""
 
 
 @dataclass(frozen=True)
 class RecordedSizes:
     sizes: NDArray
-    """Lengths (steps + 1, members) [s] of all steps and the next."""
+    """Lengths of the time steps (steps + 1, members) [s], including the step after the last state."""
     times: NDArray
     """Times (steps + 1, members) [s] of all states."""
 
 
 class StepSizes:
-    """The lengths of the steps of a rollout, in this base class fixed by the parameter ``time_step``."""
+    """The lengths of the time steps of a rollout. In this base class, they are the parameter ``time_step``."""
 
     longest_chunk = 2**31
-    """Greatest number of steps between two reads by the host."""
+    """Greatest number of steps between two reads of step lengths."""
     end = inf
-    """Latest time [s] of the end of the run; infinite if the number of steps determines the end."""
+    """End time of the run [s], or infinity."""
 
     def begin_at(self, state: State) -> None:
         """Choose the length of the first step."""
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Choose the length of the step after ``step`` steps of lengths ``sizes`` (step,) [s] by an earlier process.
-        Return True if the run ends with the state."""
+        """Choose the length of the step after ``step`` steps of an earlier process. ``sizes`` (step,) [s] are the
+        earlier lengths. Return True if the run ends with the state."""
         return False
 
     def choose(self, state: State) -> None:
-        """Choose the length of the step after ``state``; kernel launches only."""
+        """Choose the length of the step after ``state``."""
 
     def seek(self, step: int) -> None:
-        """Set the solver to the recorded length of a step, counted from 0."""
+        """Set the solver to the recorded length of a step. The first ``step`` is 0."""
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """Read the lengths of the steps after states ``first`` to ``last``. Return the number of the run's last state
-        among them, and True if the run ends there."""
+        """Read the lengths of the steps after states ``first`` to ``last``. Return the number of the last valid state,
+        and True if the run ends with it."""
         return last, False
 
     def again(self, first: int, last: int) -> bool:
-        """Test if steps between states ``first`` and ``last`` must be retaken with a shorter length."""
+        """Test if a step between the states ``first`` and ``last`` must be repeated with a shorter length."""
         return False
 
     def is_end(self, step: int) -> bool:
@@ -191,15 +190,14 @@ class StepSizes:
         return False
 
     def of_step(self, step: int) -> NDArray | None:
-        """Return the lengths (members,) [s] of a step; None for fixed steps."""
+        """Return the lengths (members,) [s] of a step, or None for fixed steps."""
         return None
 
     def diagnostics(self, steps: int) -> dict[str, NDArray]:
-        """Return diagnostics of the first steps: arrays (steps,) by name, in a batch (steps, batch)."""
+        """Return diagnostics of the first ``steps`` steps by name: (steps,), or (steps, batch) for a batch."""
         return {}
 
     def recorded(self) -> RecordedSizes | None:
-        """Return the recorded lengths and times; None for fixed steps."""
         return None
 
     def assign(self, recorded: RecordedSizes | None) -> None:
@@ -207,10 +205,10 @@ class StepSizes:
 
 
 class ChosenSteps(StepSizes):
-    """Step lengths chosen on the device from each scene's state, see `choose` of `step_size_kernels`."""
+    """Step lengths that are chosen on the device from the state of each scene; see `step_size_kernels`."""
 
     def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
-        """Prepare the arrays for ``steps`` steps, in each of which a particle may move by ``length`` [m]."""
+        """Allocate arrays for ``steps`` steps. A particle may move by ``length`` [m] in a step."""
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
         shape = (steps + 1, layout.members)
         self._solver, self._parameters, self._length = solver, parameters, length
@@ -229,8 +227,8 @@ class ChosenSteps(StepSizes):
         self.longest_chunk = StepSizes.longest_chunk
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
-        """Prepare a run with upper bounds (steps, members) [s], and return clocks that record times. With
-        ``scheduled`` parameters the host reads every step."""
+        """Prepare a run with upper bounds (steps, members) [s] of the time steps, and return clocks that
+        record times."""
         self._steps, room = len(bounds), len(self._bounds)
         self._bounds.assign(np.pad(bounds, ((0, room - len(bounds)), (0, 0)), mode="edge"))
         self._first.assign([clock.time_step for clock in clocks])
@@ -258,7 +256,7 @@ class ChosenSteps(StepSizes):
         return self.is_end(step)
 
     def end_after(self, duration: float) -> None:
-        """End the run of a single scene with the first state at least ``duration`` [s] after its start."""
+        """End the run of a single scene at the first state that is at least ``duration`` [s] after its start."""
         self.end = float(self._read.times[0, 0]) + duration
 
     def choose(self, state: State) -> None:
@@ -303,8 +301,7 @@ class ChosenSteps(StepSizes):
         return bool(self._read.times[step, 0] >= self.end)
 
     def _look(self, first: int, last: int) -> None:
-        """Read the lengths and times of steps; with scheduled parameters, shorten the last step to their bound and
-        write their rows."""
+        """Read the lengths and times of steps."""
         for found, array in ((self._read.sizes, self._sizes), (self._read.times, self._times)):
             found[first : last + 1] = array[first : last + 1].numpy()
         if self._scheduled is None:
@@ -338,8 +335,8 @@ class ChosenSteps(StepSizes):
 
 @cache
 def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels without derivatives: ``speeds`` computes squared speeds of particles, ``choose`` the time step
-    of each scene."""
+    """Return two kernels: ``speeds`` computes the squared speeds of particles, ``choose`` the time step of
+    each scene."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
     typed = TypesByName(real, {pair: "greatest squares", vector: "v", wp.int32: "step"})
@@ -365,11 +362,11 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
         longest: wp.array2d(dtype=real),
         time_step,
     ):
-        """Write dt = min(bound, max(length / max |v|, least bound), growth dt of the step before), and the time before
-        the step.
+        """Write the time before the step, and the time step dt of each scene.
 
-        ``length``: greatest move of a particle in a step; ``first``: dt of the step before the first step, or 0;
-        ``longest``: dt without the last term. Speeds of 0, and infinite speeds of lost particles, do not bound dt.
+        dt is the minimum of three terms: ``bounds``, ``growth`` times the previous dt, and ``length`` divided by the
+        greatest speed. The third term is at least ``least`` times ``bounds``. ``first`` is the dt before the first
+        step, or 0. ``longest`` is dt without the growth term.
         """
         b = wp.tid()
         n = step[b]

@@ -1,5 +1,5 @@
-"""Steps of a simulation as a function of a state and of parameters, with derivatives; `Stepping` adds the functions to
-simulations."""
+"""Time steps of a simulation as a function of a state and of parameters, with derivatives. The class `Stepping` adds
+the methods to simulations."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -34,11 +34,11 @@ from cortado.scene.parameter_values import Arrays, Values
 
 KEPT = 4
 MOST_GROWTH = 10.0
-"""Greatest growth of an adjoint without a warning [e-folds]."""
+"""Growth of an adjoint that causes a warning [e-folds]."""
 
 
 class ReverseEstimator(Protocol):
-    """Protocol of `cortado.gradients.AdjointEstimator`, an estimator with a backward pass step by step."""
+    """Protocol of gradient estimators with a backward pass through each step."""
 
     @property
     def batches(self) -> bool:
@@ -49,7 +49,7 @@ class ReverseEstimator(Protocol):
 
 
 def require_hash(estimator: Any) -> Any:
-    """Return an estimator that is a key of a cache; raise `InputError` if its settings may change."""
+    """Return an estimator that can be the key of a cache. Raises `InputError` if its settings can change."""
     try:
         hash(estimator)
     except TypeError as error:
@@ -58,14 +58,12 @@ def require_hash(estimator: Any) -> Any:
 
 
 class BackwardSteps:
-    """A cache of the backward steps of estimators for a rollout."""
-
     def __init__(self, rollout: Rollout):
         self._rollout, self._made = rollout, dict[ReverseEstimator | None, BackwardStep]()
 
     def of(self, estimator: ReverseEstimator | None) -> BackwardStep:
-        """Return the backward step of an estimator, by default of the exact one. Raise `InputError` for an estimator
-        with variable settings, or, in a batch, for one that may mix up scenes."""
+        """Return the backward step of an estimator, by default of the exact estimator. Raises `InputError` if the
+        estimator's settings can change, or if it may mix scenes of a batch."""
         solver = self._rollout.solver
         if estimator is not None:
             wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
@@ -85,7 +83,7 @@ class BackwardSteps:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepResidual(Staying):
-    """The data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`, valid after further steps."""
+    """The stored data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`. Further steps do not change the data."""
 
     evaluation: Residual
     values: Arrays
@@ -100,11 +98,12 @@ class StepResidual(Staying):
 
 
 class AdjointGrowth:
-    """The growth of the adjoint of a simulation's states over successive calls of `Stepper.vjp`.
+    """The growth of the adjoint of states over successive calls of `Stepper.vjp`.
 
-    A call continues a chain if its steps end at the time at which the previous call's steps began. The growth in
-    e-folds is the smaller of the norm's growth since the chain began, and the sum of the growths within calls, to
-    exclude losses and policies between calls. The norm is sqrt(|x^|^2 + |v^|^2 / T^2) with the time T of the chain.
+    Calls form a chain if the steps of each call end where the steps of the previous call began. The growth is the
+    smaller of two values: the growth of the norm over the whole chain, and the sum of the growths in the calls. The
+    norm of the adjoints x^ of positions and v^ of velocities is sqrt(|x^|^2 + |v^|^2 / T^2), where T is the duration of
+    the chain.
     """
 
     def __init__(self) -> None:
@@ -113,7 +112,7 @@ class AdjointGrowth:
         self._warned = False
 
     def follow(self, rollout: Rollout, last: State, first: State) -> None:
-        """Add a call with adjoints of the ``last`` and the ``first`` state; warn once if the growth exceeds
+        """Add the adjoints of the ``last`` and the ``first`` state of a call. Warn once if the growth exceeds
         `MOST_GROWTH`."""
         size = float(rollout.time_steps[0])
         start, end = (rollout.clocks[0].after(steps, size).time for steps in (0, rollout.steps))
@@ -136,17 +135,15 @@ class AdjointGrowth:
 
 
 def _norm(bar: wp.array) -> float:
-    """Return the Euclidean norm of an array, infinite if squares overflow."""
     numbers = bar.numpy().reshape(-1) if bar.device.is_cpu else None
     return math.sqrt(wp.utils.array_inner(bar, bar) if numbers is None else numbers @ numbers)
 
 
 class Stepper:
-    """A fixed number of steps of a simulation, as a function of the first state and of parameters. All calls share
-    arrays, graphs and kernels."""
+    """A fixed number of steps of a simulation, as a function of the first state and of parameters."""
 
     def __init__(self, simulation: Simulated, steps: int):
-        """Prepare a rollout of ``steps`` steps, which may be 0."""
+        """Prepare ``steps`` steps; the number may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
@@ -157,12 +154,12 @@ class Stepper:
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds while it uses the simulation."""
+        """Lock of the simulation, for one call at a time."""
         return self.rollout.turn
 
     @in_turn
     def first(self, parameters: Values | None = None) -> States:
-        """Return the state before the first step of a run with these parameters."""
+        """Return the state before the first step of a run with the given parameters."""
         self._space.begin(self.rollout, self._checked(parameters))
         return HostStates(self._simulation).state(self.rollout, self.rollout.initial, 0)
 
@@ -183,7 +180,7 @@ class Stepper:
 
     @in_turn
     def advance(self, state: Any, parameters: Values | None = None, place: HostStates | None = None) -> Any:
-        """Return the state after the steps, on the device if ``state`` is, or in the form of ``place``. Parameters over
+        """Return the state after the steps. If ``state`` is on the device, the result is on the device. Parameters over
         time may be Warp arrays on the device in the simulation's precision, which are not checked."""
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, place=place)
@@ -191,9 +188,10 @@ class Stepper:
 
     @in_turn
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
-        """Return the state after the steps, with the parameters of the last `advance` except ``rows`` (batch, steps,
-        ...), for controllers of many scenes. ``rows`` must include all parameters over time of the last `advance`, and
-        are not checked."""
+        """Return the state after the steps, with the parameters of the last `advance` and new parameters over time.
+
+        ``rows`` are the values of all parameters over time, (batch, steps, ...). They are not checked.
+        """
         place = DeviceStates(self._simulation)
         if self._space.depends_on_time(rows):
             place.begin(self._space, self.rollout, state, dict(rows), set())
@@ -208,8 +206,8 @@ class Stepper:
     ) -> tuple[Any, StepResidual]:
         """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist.
 
-        ``along``: further parameters in directions of `jvp`. Only the mobility must be named, because fluid with
-        mobility 0 is computed without diffusion. Parameters may be on the device, and ``place`` is as in `advance`.
+        ``along`` names further parameters that `jvp` may vary. Only the mobility must be named, because fluid with
+        mobility 0 is computed without diffusion. Parameters may be on the device, as in `advance`.
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)}, place)
@@ -221,13 +219,15 @@ class Stepper:
         self, residual: StepResidual, state_bar: Values, gradient: ReverseEstimator | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the adjoints of the first state and of the given parameters, given the adjoint ``state_bar`` of the
-        last state (reverse mode). ``gradient``: the estimator, by default the exact one, see `docs/gradients.md`.
+        last state (reverse mode). ``gradient`` is the estimator, by default the exact one; see `docs/gradients.md`.
 
-        The adjoint of a state is a table of arrays by field name, in the fields' shapes, and a number ``time``; missing
-        entries are 0. Arrays of a `DeviceState` are on the device; all other results are in float64. In a batch, arrays
-        have a first axis for the scenes. Results for a lost scene are NaN, or 0 if its adjoint in ``state_bar`` is 0.
-        The adjoint of a parameter on the device is on the device, in the parameter's shape. Raise `InputError` for
-        unknown fields, or fields of other shapes.
+        The adjoint of a state is a table of arrays by field name, in the shapes of the fields, with a number ``time``.
+        Missing entries are 0. Arrays of a `DeviceState` are on the device, and arrays on the host are in float64. For a
+        batch, each array has a first axis for the scenes. Results for a lost scene are NaN, or 0 if its adjoint in
+        ``state_bar`` is 0.
+
+        The adjoint of a parameter on the device is also on the device, in the shape of the parameter. Raises
+        `InputError` for unknown fields and for wrong shapes.
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         adjoint = self._derivatives.of(gradient)
@@ -250,8 +250,8 @@ class Stepper:
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
-        """Return the tangent of the last state, given the tangents of the first state and of parameters (forward mode),
-        in the same form as adjoints in `vjp`."""
+        """Return the tangent of the last state, given the tangents of the first state and of parameters (forward mode).
+        Tangents have the form of the adjoints in `vjp`."""
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         looked_at, rows = self._rows.split(parameter_dots, "direction")
         along = space.checked(looked_at, "direction")
@@ -294,7 +294,6 @@ class Stepper:
         varied: Iterable[str] = (),
         place: HostStates | None = None,
     ) -> HostStates:
-        """Set the first state and parameters of the rollout; return the interface to states on the host or device."""
         place = place or (DeviceStates if isinstance(state, DeviceState) else HostStates)(self._simulation)
         place.begin(self._space, self.rollout, state, values, set(varied))
         self._rows.write(rows, self.rollout.parameters)
@@ -315,38 +314,38 @@ class Stepper:
 
 
 class Stepping:
-    """The methods of a simulation that take steps and differentiate them, such as `step`, `vjp` and `jvp`."""
+    """Methods of a simulation that take time steps and differentiate them, such as ``step``, `vjp` and `jvp`."""
 
     @property
     def turn(self) -> Turn:
-        """The lock that a thread holds while it uses the simulation."""
+        """Lock of the simulation, for one call at a time."""
         raise NotImplementedError
 
     def state(self, parameters: Values | None = None) -> States:
-        """Return the state before the first step, for `step` and ``Simulation.run(state=...)``; in a batch a tuple of
-        the states of all scenes.
+        """Return the state before the first step, for ``step`` and ``Simulation.run(state=...)``. For a batch, return a
+        tuple with the state of each scene.
 
-        ``parameters``: parameters of `Problem` on which the first state depends, such as ``initial_velocities``. Raise
-        `InputError` for unsuitable parameters.
+        ``parameters`` are parameters of `Problem` that change the first state, such as ``initial_velocities``. Raises
+        `InputError` for any other parameter.
         """
         return self.stepper(0).first(parameters)
 
     def on_device(
         self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
     ) -> DeviceState:
-        """Return a state, by default the first state, in arrays on the device, which other programs read by DLPack.
-        Steps from this state stay on the device.
+        """Return a state in arrays on the device, for other programs with DLPack. The default is the first state. Steps
+        from the returned state stay on the device.
 
-        ``fields``: arrays with the DLPack interface that replace fields of the state, in the precision and on the
-        device of the simulation: vectors (n, 3), fractions (n, phases), numbers (n,), in a batch (batch, n, ...). The
-        new state is checked on the host. ``parameters``: those of the run to which the state belongs. Raise
-        `InputError` for unsuitable input.
+        ``fields`` are arrays with the DLPack interface that replace fields of the state: (n, 3) for vectors, (n,
+        phases) for fractions, (n,) for numbers. For a batch, each array has a first axis for the scenes. The arrays
+        must have the precision and the device of the simulation. The new state is checked on the host. ``parameters``
+        are the parameters of the run to which the state belongs. Raises `InputError` for invalid input.
         """
         return self.stepper(0).on_device(state, fields or {}, parameters)
 
     def on_host(self, state: DeviceState) -> States:
-        """Copy a ``state`` on the device to NumPy arrays, for files, other processes and ``Simulation.run``. Raise
-        `InputError` for a state of another simulation."""
+        """Copy a ``state`` on the device to NumPy arrays, for files, other processes and ``Simulation.run``. Raises
+        `InputError` for a state of a different simulation."""
         return self.stepper(0).on_host(state)
 
     @overload
@@ -356,13 +355,13 @@ class Stepping:
     def step(self, state: DeviceState, parameters: Values | None = None, steps: int = 1) -> DeviceState: ...
 
     def step(self, state: Any, parameters: Values | None = None, steps: int = 1) -> Any:
-        """Return the state after ``steps`` steps from ``state``, with the bits of ``run(steps, parameters,
-        state=state)``; in a batch a tuple of the states of all scenes, NaN for a lost scene. From a `DeviceState`
-        return another `DeviceState`.
+        """Return the state after ``steps`` steps from ``state``. The result is exactly the last state of ``run(steps,
+        parameters, state=state)``.
 
-        ``parameters``: any parameters of `Problem` except first values, which ``state`` contains; a parameter over time
-        has a row for each of the ``steps``. Further calls with the same number of steps are faster. Warnings and errors
-        are those of `Simulation.run`.
+        For a batch, the result is a tuple with the state of each scene, and the state of a lost scene is NaN. For a
+        `DeviceState`, the result is a `DeviceState`. ``parameters`` are any parameters of `Problem` except first
+        values, which ``state`` contains. A parameter over time has a first axis of length ``steps``. Further calls with
+        the same number of steps are faster. Warnings and errors are as in `Simulation.run`.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
 
@@ -375,7 +374,7 @@ class Stepping:
         gradient: ReverseEstimator | None = None,
     ) -> tuple[dict[str, Any], Arrays]:
         """Return the adjoints of ``state`` and of ``parameters``, given the adjoint ``state_bar`` of the state after
-        ``steps`` steps, by the estimator ``gradient`` (reverse mode); see `Stepper.vjp`, also for several adjoints."""
+        ``steps`` steps (reverse mode). ``gradient`` is the estimator; see `Stepper.vjp`."""
         stepper = self.stepper(check_steps(steps))
         return stepper.vjp(stepper.step(state, parameters)[1], state_bar, gradient)
 
@@ -395,7 +394,7 @@ class Stepping:
 
     @in_turn
     def stepper(self, steps: int) -> Stepper:
-        """Return the `Stepper` for this number of steps; the last few steppers are cached."""
+        """Return the `Stepper` for this number of steps. The last few steppers are cached."""
         steppers: dict[int, Stepper] = self.__dict__.setdefault("_steppers", {})
         found = steppers.pop(steps, None) or Stepper(cast(Simulated, self), check_steps(steps, least=0))
         steppers[steps] = found  # the last one

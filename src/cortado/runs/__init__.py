@@ -1,4 +1,4 @@
-"""Results of a run: trajectories and run folders; and what is computed from its states: quantities and sensors."""
+"""Results of runs: trajectories, run folders, quantities and sensors."""
 
 from typing import TYPE_CHECKING
 

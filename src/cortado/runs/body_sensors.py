@@ -1,4 +1,4 @@
-"""Sensors of free bodies: the force in a spring, and the motion of a body."""
+"""Sensors of free bodies: the force of a spring, and the motion of a free body."""
 
 from functools import cache
 from typing import Any
@@ -25,7 +25,6 @@ from cortado.sph.springs import NUMBERS, PoseBars, Springs, numbers_of, springs_
 
 @cache
 def six_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Make a kernel that copies a vector to the first components of a load, and its adjoint."""
     real, vector, module = precision.real, precision.vector, kernel_module(f"spring_load_{precision.name}")
 
     @wp.kernel(module=module, enable_backward=False)
@@ -42,7 +41,7 @@ def six_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 class SpringLoads:
-    """The force and length of a spring at the start of a step, in the first two numbers of a load."""
+    """The force and the length of a spring at the start of a time step, as the first two components of a load."""
 
     def __init__(self, springs: Springs, spring: Ends):
         layout, self._springs, self._spring = springs.layout, springs, spring
@@ -79,20 +78,21 @@ class SpringLoads:
 
 
 def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
-    """Make the formulas of the forces in a solver's springs, by name."""
     return {load_name(spring.name): SpringLoads(springs, spring) for springs, spring in springs_in(solver)}
 
 
 @fixed
 class SpringForce(Summed):
-    """A sensor of a spring's force (positive if it pulls, negative if it pushes) and of its length in a state. The
-    damper's part of the force is computed from the velocities of both ends in the step that begins at the state.
+    """A sensor of the force and the length of a spring.
+
+    The force is positive if the spring pulls and negative if the spring pushes. It includes the force of the damper,
+    for the velocities of the end points in the step after the state.
 
     Example: ``run = simulation.run(100, sensors={"line": cortado.sensors.SpringForce("line")})``
     """
 
     def __init__(self, spring: str):
-        """Take the name of a ``spring`` in the scene."""
+        """Measure the spring with the name ``spring``."""
         self.spring = named("spring", spring, "spring")
 
     def columns(self, dimension: int) -> dict[str, str]:
@@ -110,16 +110,16 @@ class SpringForce(Summed):
 
 @fixed
 class BodyMotion(Summed):
-    """A sensor of a free body: the position of its middle, its rotation, its velocity and its angular velocity.
+    """A sensor of the motion of a free body: the position of its middle, its rotation, velocity and angular velocity.
 
     The rotation is an angle in 2-D and a rotation vector in 3-D, of at most half a turn. At half a turn the value jumps
-    by a whole turn; its derivative is continuous there.
+    by a whole turn, but the derivative is continuous.
 
     Example: ``run = simulation.run(100, sensors={"raft": cortado.sensors.BodyMotion("raft")})``
     """
 
     def __init__(self, solid: str):
-        """Take the name of a ``solid`` of the scene that moves freely."""
+        """Measure the free body with the name ``solid``."""
         self.solid = named("solid", solid, "solid")
 
     def columns(self, dimension: int) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Frames of a run: their times, the VTKHDF file, the frames of a film, and the poses of moving solids."""
+"""Frames of a run and of a film, their times, and the poses of solids."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from cortado.scene.scene import Scene
 from cortado.scene.solids import SolidTable
 
 SAME = 1e-9
-"""Tolerance, in frame intervals: a state that is early by less counts as due, because times are rounded."""
+"""Tolerance of the time of a frame, in frame intervals."""
 FRACTION = "mass_fraction_"
 SHORTEST, LONGEST = 4.0, 10.0
-"""Shortest and longest film [s], if the user sets no number of frames."""
+"""Shortest and longest film by default [s]."""
 FEW = 1.0
-"""Length [s] of a film with few frames, if this length still gives at least `SLOWEST` frames per second."""
+"""Length of a film with few frames [s]."""
 SLOWEST, USUAL = 6.0, 25.0
-"""Least and usual number of frames per second of a film."""
+"""Smallest and usual number of frames per second of a film."""
 SMOOTH = 12.0
 SHORT = 1.5
 EARLY = 1e-6
-"""Tolerance, in frame intervals, for the test whether the last frame was recorded before it was due."""
+"""Tolerance for the time of the last frame, in frame intervals."""
 EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
 
 
@@ -55,30 +55,29 @@ Times = Sequence[float] | NDArray
 
 @dataclass(frozen=True)
 class Marks:
-    """The times at which frames are due: frame k is the first state at or after the time start + k / rate."""
+    """Due times of the frames of a run. Frame k is the first state at or after the time start + k / rate."""
 
     start: float
-    """[s]"""
+    """Time of frame 0 [s]."""
     rate: float
-    """[1/s]"""
+    """Number of frames per second [1/s]."""
 
     def passed(self, times: NDArray[Any]) -> NDArray[np.int64]:
-        """Return the number of the last mark at or before each of the times (n,) [s]."""
+        """Return for each of ``times`` (n,) [s] the number of the last due frame."""
         return np.floor((np.asarray(times) - self.start) * self.rate + SAME).astype(np.int64)
 
     def at(self, numbers: NDArray[Any]) -> NDArray[np.float64]:
         return self.start + np.asarray(numbers) / self.rate
 
     def due(self, times: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the due times (frames,) [s] of recorded frames; between marks without a frame of their own, their
-        ``times``."""
+        """Return the due times (frames,) [s] of frames recorded at ``times`` (frames,) [s]. After skipped due times,
+        the recorded times are returned."""
         numbers = self.passed(times)
         one_by_one = np.diff(numbers, prepend=numbers[:1] - 1) == 1
         return np.where(one_by_one, self.at(numbers), times)
 
     def chosen(self, times: NDArray[Any], stride: int) -> Marks | None:
-        """Return the marks of every ``stride``-th frame; None if the frames, except the last, are not evenly spaced on
-        marks."""
+        """Return the due times of every ``stride``-th frame, or None if the chosen frames are not evenly spaced."""
         numbers = self.passed(times)
         apart = np.diff(numbers)
         every = 1 if stride == 1 else int(apart[0]) if len(apart) else 0
@@ -88,7 +87,7 @@ class Marks:
 
 
 def common_rate(each: Iterable[Marks | None]) -> float | None:
-    """Return the frame rate [1/s] of all runs; None if their rates differ or a run has no rate."""
+    """Return the common frame rate [1/s] of runs, or None if they have no common rate."""
     rates = {None if marks is None else marks.rate for marks in each}
     return rates.pop() if len(rates) == 1 else None
 
@@ -96,8 +95,8 @@ def common_rate(each: Iterable[Marks | None]) -> float | None:
 def frame_writer(
     path: str | Path, first: Fields, diagnostics: Fields, origin: Origin | None, marks: Marks | None, **layout: Any
 ) -> vtkhdf.TrajectoryWriter:
-    """Open a trajectory file for frames with the fields of ``first``. ``layout``: the names of ``quantities``, and
-    further arguments of `TrajectoryWriter`."""
+    """Open a trajectory file for frames with the fields of ``first``. ``layout`` has the names of the ``quantities``,
+    and further arguments of `TrajectoryWriter`."""
     quantities = layout.pop("quantities")
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
@@ -121,7 +120,8 @@ def frame_writer(
 def append_frame(
     writer: vtkhdf.TrajectoryWriter, frame: Fields, step: int, quantities: Fields, time: float | None = None
 ) -> None:
-    """Write the frame after ``step`` steps, with ``time`` [s] if it differs from the time given to `frame_writer`."""
+    """Write the frame after ``step`` steps. By default, its time is the time that `frame_writer` was given. ``time``
+    [s] replaces it."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
     scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **quantities}
     writer.append(frame["positions"], frame["velocities"], step=step, time=time, others=_others(frame), **scalars)
@@ -137,23 +137,26 @@ def fraction_names(phases: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Pace:
-    """The frames that a film shows, and the time of each in the film."""
+    """The chosen frames of a film, and their times in the film."""
 
     frames: tuple[int, ...]
     times: tuple[float, ...]
     speed: float
-    """simulated seconds per second of film [-]"""
+    """Simulated seconds per second of the film [-]."""
     recorded: int
     enough: float
-    """frames per simulated second [1/s] that give the film `USUAL` frames per second"""
+    """Number of frames per simulated second for `USUAL` frames per second of the film [1/s]."""
     is_asked: bool
     of_search: bool = False
-    """True for the frames of a search, whose number is the key ``film_frames`` of [picture]"""
+    """True for the film of a search."""
 
     @classmethod
     def of(cls, times: Times, count: int | None = None, speed: float | None = None, rate: float | None = None) -> Pace:
-        """Choose the pace for frames at ``times`` [s], at most ``count``. Without ``speed`` the film is in real time,
-        unless it would be too short or too long. With the ``rate`` of the recording [1/s] it shows every k-th frame."""
+        """Choose at most ``count`` frames from frames at ``times`` [s].
+
+        The default ``speed`` is real time, unless the film would be too short or too long. With the recorded frame
+        ``rate`` [1/s] the film shows every k-th frame.
+        """
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None:
@@ -221,8 +224,8 @@ class Film:
 
 
 def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
-    """Return the pace that [picture] sets for frames at ``times`` [s]; warn if it sets more frames than were
-    recorded."""
+    """Return the pace for frames at ``times`` [s] from the table [picture]. Warn if the table asks for more frames than
+    were recorded."""
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
@@ -232,14 +235,12 @@ def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
 
 
 def _whole(times: Times, rate: float) -> int:
-    """Return the number of frames, without a last frame that was recorded before it was due."""
     is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - EARLY
     return len(times) - 1 if is_early else len(times)
 
 
 def _speed(span: float, count: int, easy: float) -> float:
-    """Return the speed of a film of at most ``count`` frames over ``span`` [s]: ``easy`` if there are enough frames for
-    it, otherwise a higher speed for which they suffice."""
+    """Return the speed of a film of at most ``count`` frames over ``span`` [s]. It is at least ``easy``."""
     if span <= 0.0:
         return 1.0
     room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))
@@ -259,18 +260,16 @@ def _easy_speed(span: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class SolidMotion:
-    """The pose of one moving solid in every frame."""
-
     positions: NDArray[Any]
-    """(frames, d) [m]"""
+    """Positions of the solid's middle (frames, d) [m]."""
     rotations: NDArray[Any]
-    """(frames, 3) rotation vectors about the middle, in 2-D (frames,) angles [rad]"""
+    """Rotation vectors (frames, 3) [rad], or in 2-D angles (frames,)."""
     velocities: NDArray[Any] | None = None
-    """(frames, d) velocities of the middle of a free body [m/s]; None for a prescribed motion"""
+    """Velocities of the middle of a free body (frames, d) [m/s], or None for a prescribed motion."""
     angular_velocities: NDArray[Any] | None = None
-    """(frames, 3), in 2-D (frames,), angular velocities of a free body [rad/s]; None for a prescribed motion"""
+    """Angular velocities of a free body (frames, 3) [rad/s], in 2-D (frames,), or None for a prescribed motion."""
     scale: float = 1.0
-    """size of a solid with prescribed motion relative to its size in the scene"""
+    """Size of the solid relative to its size in the scene."""
 
     @classmethod
     def of(cls, name: str, fields: Mapping[str, NDArray[Any]], dimension: int) -> Self:
@@ -289,15 +288,15 @@ class SolidMotion:
         return replace(self, positions=places, rotations=turns, velocities=velocities, angular_velocities=spins)
 
     def carried(self, shifts: NDArray[Any]) -> Self:
-        """Return the motion extrapolated by ``shifts`` (frames,) [s] with the velocities of a free body."""
+        """Extrapolate the motion by ``shifts`` (frames,) [s] with constant velocities of the free body."""
         assert self.velocities is not None and self.angular_velocities is not None
         places, turns = self.positions + shifts[:, None] * self.velocities, (shifts * self.angular_velocities.T).T
         rotations = self.rotations + turns if turns.ndim == 1 else _product(turns, self.rotations)
         return replace(self, positions=places, rotations=rotations)
 
     def between(self, known: NDArray[Any], times: NDArray[Any], table: SolidTable) -> Self:
-        """Return the motion at ``times`` (k,) [s]: the path in ``table`` plus the interpolated deviation of recorded
-        poses from this path. Frames are at times ``known`` (frames,) [s]."""
+        """Return the motion at ``times`` (k,) [s], interpolated between frames at the times ``known`` (frames,) [s].
+        ``table`` has the path of the solid."""
         shift, turn = courses(table)
         kept = self.positions - shift.at(known)
         places = np.stack([np.interp(times, known, x) for x in kept.T], axis=1) + shift.at(times)
@@ -312,7 +311,7 @@ class SolidMotion:
 
 
 class SolidMotions(dict[str, SolidMotion]):
-    """Motions of solids by name; an unknown name raises `InputError`."""
+    """Motions of solids by name. An unknown name raises `InputError`."""
 
     @classmethod
     def of(cls, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotions:
@@ -324,8 +323,8 @@ class SolidMotions(dict[str, SolidMotion]):
         raise InputError(f"solids has no {shown(name)}, as the run {known}.")
 
     def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> SolidMotions:
-        """Return the motions at ``times`` (k,) [s], each close to the frame ``recorded`` (k,) of frames at ``known``
-        (frames,) [s]."""
+        """Return the motions at ``times`` (k,) [s], interpolated between frames at the times ``known`` (frames,) [s].
+        ``recorded`` (k,) are the numbers of the nearest frames."""
         shifts, tables = times - known[recorded], {table.name: table for table in told(scene.solid)}
         if not shifts.any():
             return SolidMotions({name: motion[recorded] for name, motion in self.items()})
@@ -339,7 +338,6 @@ class SolidMotions(dict[str, SolidMotion]):
 
 
 def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return the rotation ``begun`` followed by matrices ``axes`` (frames, d, 3); in 2-D angles without jumps."""
     if dimension == 2:
         return np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])) + begun
     from scipy.spatial.transform import Rotation
@@ -359,7 +357,6 @@ def sized(scene: Scene, motions: Mapping[str, SolidMotion]) -> Scene:
 
 
 def posed(scene: Scene, motions: Mapping[str, SolidMotion], frame: int) -> Scene:
-    """Return the scene with its solids at their poses in a frame."""
     tables = []
     for table in sized(scene, motions).solid:
         if motion := motions.get(table.name):

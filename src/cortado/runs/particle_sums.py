@@ -1,9 +1,11 @@
-"""Sums over particles that sensors read: weighted sums around a place, sums over a region, and loads on solids. The
-sums are computed here on the host, in float64; during a run `cortado.runs.step_sums` computes them on the device.
+"""Sums over particles for sensors: weighted sums around a place, sums over a region, and loads on solids.
 
-A sensor may ride on a solid, which carries an initial point x to c + T (x - c_0). Here c_0 is the initial middle of the
-solid, c its present middle, and T = R R_0^T its rotation since the start. If a place is shifted by s and turned by a
-small vector t about c, the value of its sensor changes by ``shift`` . s + ``twist`` . t.
+The sums are computed here on the host, in float64. During a run, `cortado.runs.step_sums` computes the sums on the
+device.
+
+A solid may carry a sensor. The solid moves an initial point x to c + T (x - c_0), with the rotation T of the solid
+since the start, its initial middle c_0, and its current middle c. Derivatives of a reading with respect to the pose of
+the solid are ``shift`` for the translation and ``twist`` for a small rotation about c.
 """
 
 from abc import abstractmethod
@@ -25,13 +27,11 @@ Axes = Literal["world", "body"]
 
 @dataclass(frozen=True)
 class Ride:
-    """The solid that carries the place of a sensor."""
-
     on: str
     turns: bool
 
     def table(self, at: SensedScene) -> SolidTable:
-        """Return the table of the solid; raise `InputError` unless it moves."""
+        """Return the table of the solid. Raises `InputError` unless the solid moves."""
         moving = {table.name: table for table in at.solids if table.moves}
         if self.on not in moving:
             names = f", of {', '.join(map(shown, moving))}" if moving else "; the scene has none"
@@ -53,16 +53,16 @@ class Ride:
 class Carrier:
     pose: Pose
     begun: NDArray[Any]
-    """c_0, (d,) [m]"""
+    """Initial middle of the solid (d,) [m]."""
     turn: NDArray[Any]
-    """T, (3, 3)"""
+    """Rotation of the solid since the start, (3, 3)."""
 
     @property
     def flat(self) -> NDArray[Any]:
         return self.turn[: len(self.begun), : len(self.begun)]
 
     def place(self, point: NDArray[Any]) -> NDArray[Any]:
-        """Return the place [m] to which the solid has carried an initial point (d,)."""
+        """Return the current place [m] of an initial point (d,) [m] of the solid."""
         return np.asarray(self.pose.position + self.flat @ (point - self.begun))
 
     def arms(self, points: NDArray[Any]) -> NDArray[Any]:
@@ -70,16 +70,17 @@ class Carrier:
         return in_space(points - self.pose.position)
 
     def bars(self, shift: NDArray[Any], twist: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert derivatives with respect to a shift (d,) and a small rotation (3,) to adjoints of state fields."""
+        """Convert derivatives with respect to a translation (d,) and a small rotation (3,) to adjoints of
+        state fields."""
         return {position_name(self.pose.name): shift[None]} | self.pose.turning_bars(twist)
 
     def lifted(self, bar: NDArray[Any], point: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert the derivative (d,) with respect to the carried place of ``point`` (d,) to adjoints of state
+        """Convert the derivative ``bar`` (d,) with respect to the current place of ``point`` (d,) to adjoints of state
         fields."""
         return self.bars(bar, np.cross(self.arms(self.place(point)), in_space(bar)))
 
     def carried(self, bars: NDArray[Any], points: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert derivatives (n, d) with respect to points (n, d) relative to the solid to adjoints of state
+        """Convert derivatives (n, d) with respect to points (n, d) in the frame of the solid to adjoints of state
         fields."""
         return self.bars(-bars.sum(axis=0), -np.cross(self.arms(points), in_space(bars)).sum(axis=0))
 
@@ -93,7 +94,7 @@ def ride_of(on: str | None, turns: bool, at: SensedScene) -> Ride | None:
 
 
 def square(turn: NDArray[Any]) -> NDArray[Any]:
-    """Extend a rotation (d, d) to three dimensions; a 2-D rotation becomes one about z."""
+    """Extend a rotation (d, d) to a rotation matrix (3, 3)."""
     found = np.eye(3)
     found[: len(turn), : len(turn)] = turn
     return found
@@ -108,7 +109,8 @@ def together(*each: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def axes_of(axes: Any, is_carried: bool) -> Axes:
-    """Return "world" or "body"; raise `InputError` for anything else, and for "body" without a solid."""
+    """Return the axes of a sensor, "world" or "body". Raises `InputError` for other values, and for "body" without a
+    solid."""
     if not isinstance(axes, str) or axes not in ("world", "body"):
         raise InputError(f'axes is {shown(axes)}, but must be "world" or "body".')
     if axes == "body" and not is_carried:
@@ -117,36 +119,35 @@ def axes_of(axes: Any, is_carried: bool) -> Axes:
 
 
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
-"""Factor, by number of dimensions, which divided by reach^dimensions gives w the integral 1."""
+"""Normalisation factor of the weights, by dimension."""
 LEAST_REACH = 5.0
-"""Reach in spacings with which the weights of a lattice add up to 1 within 0.1 %."""
+"""Least reach of the weights for an accuracy of 0.1 % [spacings]."""
 MOST_PARTS = 40
 
 
 def weights_of(q: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return weights w(q) = (1 - q)^4 (1 + 4 q), 0 for q > 1, where q is distance / reach (Wendland 1995), and w'(q) /
-    q."""
+    """Return the weights w(q) = (1 - q)^4 (1 + 4 q), which are 0 for q > 1, and the derivatives w'(q) / q (Wendland
+    1995). q is the distance divided by the reach."""
     rest = np.clip(1.0 - q, 0.0, None)
     return rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3
 
 
 Across = Callable[[NDArray[Any]], NDArray[Any]]
-"""A linear function from vectors (n, d) to vectors (n, k), in which a sensor measures distances."""
+"""A linear function from vectors (n, d) to vectors (n, k), such as a projection onto a plane."""
 
 
 @dataclass(frozen=True, eq=False)
 class Around:
-    """A place, and how a sensor measures distances from it."""
+    """The place of a sensor, and its measure of distances."""
 
     place: NDArray[Any]
-    """(d,) [m]"""
     reach: float
     across: Across
     parts: NDArray[Any] | None = None
-    """(m, d) positions of a particle's equal parts relative to the particle [m]; None for one part"""
+    """Positions of the parts of a particle relative to the particle (m, d) [m], or None for an undivided particle."""
 
     def carried(self, carrier: Carrier, turns: bool) -> "Around":
-        """Return the place moved with a solid, and if it ``turns`` also axes and parts turned."""
+        """Return the place moved by a solid. With ``turns``, the axes of the sensor rotate with the solid."""
         place, turn = carrier.place(self.place), carrier.flat
         if not turns:
             return replace(self, place=place)
@@ -160,13 +161,13 @@ class Around:
 
 @dataclass(frozen=True)
 class Image:
-    """The particles with a weight above 0, for one periodic image of one part of each particle."""
+    """Weights of the particles near a place, for one periodic image and one part of the particles."""
 
     near: NDArray[np.int_]
     ways: NDArray[Any]
     weights: NDArray[Any]
     slopes: NDArray[Any]
-    """The second result of `weights_of`."""
+    """Derivatives of the weights, w'(q) / q in `weights_of`."""
 
 
 @dataclass(frozen=True)
@@ -197,14 +198,15 @@ class Seen:
 
     @property
     def weights(self) -> NDArray[Any]:
-        """Return the weights (n,) of particles: the mean over parts, summed over images."""
+        """Weights of particles (n,), averaged over the parts of a particle and summed over periodic images."""
         found = np.zeros(self.particles)
         for image in self.images:
             found[image.near] += image.weights
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """Convert the derivative with respect to the weights (n,) to that with respect to the vectors (n, k)."""
+        """Convert derivatives with respect to the weights (n,) to derivatives with respect to the vectors from the
+        place to the particles (n, k)."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
             found[image.near] += (each[image.near] * image.slopes / self.reach**2)[:, None] * image.ways
@@ -218,8 +220,10 @@ def reach_of(given: float | None, at: Cut) -> float:
 
 
 def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
-    """Return the positions (m, d) of a particle's parts relative to it [m], along the ``axes`` axes with the largest
-    projections; the weights of a lattice of parts add up to 1."""
+    """Return the positions (m, d) [m] of the parts of a particle relative to the particle.
+
+    Particles are divided along ``axes`` axes, so that the weights on the rest lattice add up to 1.
+    """
     spacing = at.lattice.cell ** (1.0 / at.dimension)
     count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
     best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
@@ -228,7 +232,7 @@ def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
 
 
 class Summed(Sensor):
-    """A sensor whose reading is a function of one sum over particles and of the poses of solids."""
+    """Base class of sensors whose readings are computed from one sum over particles and from the poses of solids."""
 
     def __repr__(self) -> str:
         given = [value for name, value in vars(self).items() if not name.startswith("_")]
@@ -243,11 +247,11 @@ class Summed(Sensor):
 
     @abstractmethod
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the reading (k,), given the sum (6,); of the state only the poses of solids may be used."""
+        """Return the reading (k,), given the sum (6,). Use only the poses of solids from the state."""
 
 
 class LoadSensor(Summed):
-    """A sensor of a force and its torque, in 2-D of a layer 1 m thick."""
+    """Base class of sensors of a force and its torque. In 2-D, the values are per metre of thickness."""
 
     def columns(self, dimension: int) -> dict[str, str]:
         force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")
@@ -260,13 +264,13 @@ class LoadSensor(Summed):
 
 @dataclass(frozen=True, eq=False)
 class WeightedSum:
-    """The sums of w_i and w_i q_i around a place; q is a quantity, or the velocity ``along`` a direction (d,)."""
+    """Weighted sums over the particles around a place: the sum of the weights, and the sum of the weights times a
+    quantity or a velocity component."""
 
     around: Around
     quantity: str | None = None
     along: NDArray[Any] | None = None
     ride: Ride | None = None
-    """Solid that carries the place from the initial scene."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         weights, found = self.seen(at).weights, np.zeros(6)
@@ -284,21 +288,22 @@ class WeightedSum:
 
 @dataclass(frozen=True, eq=False)
 class RegionSum:
-    """The sums of f_i and (x_i - about) x f_i between corners (d,) [m], where f is the quantity "wall_force"."""
+    """Sums of the force and the torque of the quantity "wall_force" over the particles in a box."""
 
     lower: NDArray[Any]
     upper: NDArray[Any]
     about: NDArray[Any]
     quantity: str = "wall_force"
     ride: Ride | None = None
-    """Solid that carries the region; forces and arms are then along the initial axes turned with the solid."""
+    """Solid that carries the box."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         arms, force = map(in_space, self.chosen(at))
         return np.concatenate([force.sum(axis=0), np.cross(arms, force).sum(axis=0)])
 
     def chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the particles' arms and forces (n, d); forces are 0 outside the region."""
+        """Return the vectors (n, d) from ``about`` to the particles, and the forces (n, d). Forces outside the box are
+        0."""
         if self.ride is not None:
             carrier, force = self.ride.carrier(at), at["wall_force"]
             arms = (at["positions"] - carrier.place(self.about)) @ carrier.flat
@@ -311,7 +316,7 @@ class RegionSum:
 
 @dataclass(frozen=True)
 class LoadSum:
-    """A load, or 0 for a sensor that reads only the motion of solids."""
+    """A load on a solid, or 0 for a sensor of the motion of solids."""
 
     quantity: str | None = None
 
@@ -323,21 +328,21 @@ class LoadSum:
 
 
 ParticleSum = WeightedSum | RegionSum | LoadSum
-"""A sum over particles (6,), with the name of the ``quantity`` that it reads; None for fields of the state alone."""
+"""A sum over particles (6,)."""
 
 
 def load_bars(bar: NDArray[Any], dimension: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Split the adjoint of a load into those of force (3,) and torque (3,)."""
+    """Split the adjoint of a load into the adjoints of force (3,) and torque (3,)."""
     if dimension == 3:
         return bar[:3], bar[3:]
     return in_space(bar[:2]), np.array([0.0, 0.0, bar[2]])
 
 
 def turned(found: NDArray[Any], turn: NDArray[Any]) -> NDArray[Any]:
-    """Return force and torque (6,) turned by a matrix (3, 3)."""
+    """Rotate force and torque (6,) by a matrix (3, 3)."""
     return np.asarray((found.reshape(2, 3) @ turn.T).ravel())
 
 
 def in_the_scene(found: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return the components of force and torque (..., 6) in the scene's dimension: all, or in 2-D (..., 3)."""
+    """Return the components of force and torque (..., 6) in 3-D, or (..., 3) in 2-D."""
     return found if dimension == 3 else found[..., [0, 1, 5]]

@@ -1,5 +1,5 @@
-"""Sensors of pressure, flow rate and loads; the sensors of a scene; and warnings about sensors that fluid cannot
-reach."""
+"""Sensors of pressure, flow rate and loads, the sensors of a scene, and warnings about sensors out of reach of the
+fluid."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -51,17 +51,19 @@ from cortado.scene.scene import Scene
 
 @fixed
 class PressureProbe(Summed):
-    """A sensor of the weighted mean pressure of the particles around a point; near particles have the largest weights:
+    """A sensor of the mean pressure of the particles around a point, with weights that decrease with distance:
 
     p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius).
 
-    Here r_i is a particle's distance from the point. Where there is no fluid within the radius, the reading is 0.
+    Here p_i is the pressure of particle i, r_i its distance from the point, and w a smooth function. Without fluid
+    within the radius, the reading is 0.
+
     Example: ``run = simulation.run(100, sensors={"wall": cortado.sensors.PressureProbe([0.79, 0.05])})``
     """
 
     def __init__(self, position: Any, radius: float | None = None, on: str | None = None):
-        """Place the probe at ``position`` (d,) [m]; ``radius`` [m] is the smoothing kernel's support radius if left
-        out. ``on`` names a solid that carries the probe from this initial position."""
+        """Place the probe at ``position`` (d,) [m]. The default of ``radius`` [m] is the support radius of the
+        smoothing kernel. ``on`` names a solid that carries the probe; the position is then the initial position."""
         self.position = point("position", position)
         self.radius = None if radius is None else positive("radius", radius)
         self.on = None if on is None else named("on", on, "solid that moves")
@@ -95,15 +97,20 @@ class PressureProbe(Summed):
 class FlowRate(Summed):
     """A sensor of the volume flow rate through a plane along its normal, averaged over a layer around the plane:
 
-    Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1,
+    Q = sum_i V (v_i . normal) w_i,   w_i = w(r_i / reach) with the integral 1.
 
-    where r_i is a particle's distance from the plane and V its volume, spacing^d.
+    Here v_i is the velocity of particle i, r_i its distance from the plane, V = spacing^d its volume, and w a smooth
+    function.
+
     Example: ``gate = cortado.sensors.FlowRate([0.5, 0.2], normal=[1.0, 0.0])``
     """
 
     def __init__(self, position: Any, normal: Any, reach: float | None = None):
-        """Place the plane by a point ``position`` (d,) [m] and a ``normal`` (d,); ``reach`` [m] is half the layer's
-        thickness; if left out, the larger of two support radii of the smoothing kernel and five spacings."""
+        """Place the plane by a point ``position`` (d,) [m] and a ``normal`` (d,).
+
+        ``reach`` [m] is half the thickness of the layer. By default it is two support radii of the smoothing kernel or
+        five spacings, whichever is larger.
+        """
         self.position, self.normal = point("position", position), direction("normal", normal)
         if len(self.position) != len(self.normal):
             raise InputError(
@@ -138,21 +145,26 @@ class FlowRate(Summed):
 
 @fixed
 class WallForce(LoadSensor):
-    """A sensor of the force with which the fluid pushes the walls, and of its torque:
+    """A sensor of the force F of the fluid on the walls, and of its torque T:
 
-    F = sum_i f_i,   T = sum_i (x_i - about) x f_i,
+    F = sum_i f_i,   T = sum_i (x_i - about) x f_i.
 
-    over the particles of a region, where f_i is the quantity "wall_force". The walls push the fluid with -F. The
-    reading jumps when a particle crosses the border: put it where particles exert no force in that direction.
+    The sums are over the particles i at x_i in a region, and f_i is the quantity "wall_force". The walls push the fluid
+    with -F. The reading jumps when a particle crosses the border of the region. Place the border where particles exert
+    no force in the direction of interest.
+
     Example: ``run = simulation.run(100, sensors={"force": cortado.sensors.WallForce()})``
     """
 
     def __init__(
         self, lower: Any = None, upper: Any = None, about: Any = None, on: str | None = None, axes: Axes = "world"
     ):
-        """Take corners ``lower``, ``upper`` (d,) of the region [m], unbounded if left out, and the point ``about`` (d,)
-        of the torque [m], the origin if left out. ``on`` names a solid that carries and turns both. ``axes`` of force
-        and torque are those of the "world", or of the "body", which turn with the solid."""
+        """Take the corners ``lower`` and ``upper`` (d,) of the region [m], which is unbounded by default. The torque is
+        about the point ``about`` (d,) [m], by default the origin.
+
+        ``on`` names a solid that carries and rotates the region and the point. With ``axes`` "world", force and torque
+        are along the axes of the scene. With "body", they are along axes that rotate with the solid.
+        """
         self.lower = None if lower is None else corner("lower", lower)
         self.upper = None if upper is None else corner("upper", upper)
         self.about = None if about is None else point("about", about)
@@ -204,20 +216,21 @@ class WallForce(LoadSensor):
 
 @fixed
 class SolidLoad(LoadSensor):
-    """A sensor of the force of the fluid on a solid, and of its torque about the solid's middle c,
+    """A sensor of the force F of the fluid on a solid, and of its torque T about the solid's middle c:
 
-    F = sum_i f_i,   T = sum_i (x_i - c) x f_i,
+    F = sum_i f_i,   T = sum_i (x_i - c) x f_i.
 
-    over all particles. Here -f_i is the mass of particle i times its acceleration by the solid's walls, through
-    pressure and, for no-slip walls, viscosity. The acceleration is that of the step beginning at the state. The point c
-    is the middle of the solid at the end of that step. So the solid gains the momentum that the fluid loses to it. Not
+    The sums are over all particles i at x_i. The force f_i is opposite to the force of the solid's walls on the
+    particle, through pressure and, for no-slip walls, viscosity. It is the force in the step after the state, and c is
+    the middle of the solid at the end of this step. The solid gains exactly the momentum that the fluid loses. Not
     included are contact, gravity, buoyancy in air, and user-defined forces between fluid and walls.
+
     Example: ``run = simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
     """
 
     def __init__(self, solid: str, axes: Axes = "world"):
-        """Take the name of a ``solid`` in the scene. ``axes`` of force and torque are those of the "world", or of the
-        "body" of a moving solid, which turn with it."""
+        """Measure the solid with the name ``solid``. With ``axes`` "world", force and torque are along the axes of the
+        scene. With "body", they are along axes that rotate with the solid."""
         self.solid, self.axes = named("solid", solid, "solid"), axes_of(axes, True)
 
     def summed(self, at: SensedScene) -> LoadSum:
@@ -260,14 +273,14 @@ def sensors_of(scene: Scene) -> dict[str, Sensor]:
 
 
 MOST_CELLS = 200_000
-"""Greatest number of cells, half a spacing wide, that are searched; larger containers are not checked."""
+"""Greatest number of cells for the search. Larger containers are not checked."""
 DEEP = 0.01
-"""Depth in a wall or solid, in spacings, up to which a point counts as on the surface."""
+"""Depth inside a solid for points that count as on the surface [spacings]."""
 
 
 def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
-    """Return booleans (n,): True for points (n, d) [m] that solids at rest separate from all particles (m, d) [m];
-    False with periodic axes, with emitters or without a container."""
+    """Test for each of ``points`` (n, d) [m] if solids at rest separate the point from all ``fluid`` particles (m, d)
+    [m]. The result is False for scenes with periodic axes, with emitters or without a container."""
     from scipy.ndimage import label
 
     nowhere, ends = np.zeros(len(points), dtype=bool), scene.container.extent()
@@ -294,15 +307,13 @@ MOST = 16
 
 
 class Prepared(Cut, Protocol):
-    """A simulation, as the checks of sensors need it."""
-
     scene: Scene
     positions: Points
     walls: Points
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
-    """Warn about sensors (by name) that fluid cannot reach in the initial scene."""
+    """Warn about sensors that fluid cannot reach."""
     for name, sensor in sensors.items():
         if (found := _doubt(simulation, sensor)) is not None:
             warn(f"the sensor {name!r} {found}.")
@@ -335,7 +346,6 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
 
 
 def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
-    """Return a warning if a sensor is further from fluid and solids than its reach plus their size."""
     ends = _of_things(simulation)
     points = _looked_at(ends, sensor)
     gap = float(np.linalg.norm(points - np.clip(points, *ends), axis=1).min())
@@ -355,7 +365,6 @@ def _of_things(simulation: Prepared) -> tuple[Points, Points]:
 
 
 def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
-    """Return a warning if a gauge's column does not begin at the container's bottom, or is too wide."""
     scene, ends = simulation.scene, simulation.scene.container.extent()
     assert ends is not None
     heights = corners(*ends) @ gauge.up
@@ -382,7 +391,7 @@ def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
 
 
 def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
-    """Return points (n, d) [m] of a sensor within a box (2, d) [m]; the sensor works if fluid can reach one of them."""
+    """Return points (n, d) [m] in the region of a sensor. The sensor works if fluid can reach one of the points."""
     place = sensor.position
     if isinstance(sensor, PressureProbe):
         return np.array([place])
@@ -398,7 +407,6 @@ def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
 
 
 def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
-    """Return what keeps fluid away from each of the points (n, d) [m], or None."""
     scene = simulation.scene
     d, deep = scene.dimension, DEEP * scene.discretisation.spacing
     region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()

@@ -1,19 +1,19 @@
 """Formulas of quantities on the device, with tangents and adjoints.
 
-Here n is the number density, and m a particle's mass over its volume V on the rest lattice. The vorticity is an SPH sum
-over fluid neighbours (Monaghan 1992):
+Here n is the number density, V the volume of a particle on the rest lattice, and m its mass divided by V. The vorticity
+is an SPH sum over fluid neighbours (Monaghan 1992):
 
     c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
 
-With the factor mu = -(V / d) sum_j x_j . G_j on the rest lattice, a rigidly rotating fluid has a vorticity of twice its
-angular velocity. Particle i exerts on all walls, or on those of one solid, the force
+G_ij is the kernel gradient. With the factor mu = -(V / d) sum_j x_j . G_j on the rest lattice, a rigidly rotating fluid
+has a vorticity of twice its angular velocity. The force of particle i on all walls, or on the walls of one solid, is
 
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
-where A_i is the sum over wall particles along which its pressure acts (`ParticleSolver.wall_push`), a are accelerations
-of the particle by wall forces such as viscosity, B_i is the contribution of mirror images
-(`cortado.solvers.projection.mean_stress`), and m_i s^d is the particle's mass, with the spacing s. Walls gain the
-momentum that the fluid loses.
+where s is the spacing and m_i s^d the mass of the particle. A_i is the sum over wall particles along which the pressure
+p_i acts (`ParticleSolver.wall_push`). a_i are accelerations of the particle by wall forces such as viscosity. B_i is
+the contribution of mirror images (`cortado.solvers.projection.mean_stress`). Walls gain the momentum that the fluid
+loses.
 """
 
 from collections.abc import Callable
@@ -42,27 +42,28 @@ SIX = wp.types.vector(6, wp.float64)
 
 @dataclass(frozen=True)
 class Bars:
-    """Adjoints within a step, to which adjoints of quantities are added; see `cortado.solvers.solver.WithinBar`."""
+    """Adjoints within a time step. The adjoints of quantities are added to them. See
+    `cortado.solvers.solver.WithinBar`."""
 
     of: Adjoints
-    """Adjoints at the start of the step, of sorted particles, parameters and solids."""
+    """Adjoints of sorted particles, parameters and solids."""
     p: wp.array
     stress: wp.array
-    """(n,) adjoint of the pressures of a gauge"""
+    """Adjoint of the measured pressure (n,)."""
     v_star: wp.array
 
 
 class QuantityFormula(Protocol):
-    """The formula of a quantity of sorted particles, (n,), or of six numbers per scene; ``p`` (n,) are pressures on
-    walls."""
+    """Protocol of the formula of a quantity: (n,) values of sorted particles, or six numbers for each scene. ``p`` (n,)
+    are the pressures of particles on walls."""
 
     def value(self, step: StepContext, p: Any) -> wp.array: ...
 
     def tangent(self, step: StepContext, p: Any, along: Tangents, p_dot: Any, stress_dot: Any) -> wp.array:
-        """Return the tangent, given the tangents of p and of the pressures of a gauge."""
+        """Return the tangent of the quantity, given the tangents of ``p`` and of the measured pressure."""
 
     def adjoint(self, step: StepContext, p: Any, own: wp.array, bar: Bars) -> None:
-        """Add to ``bar``, given the quantity's adjoint ``own``."""
+        """Add the adjoints of the arguments to ``bar``. ``own`` is the adjoint of the quantity."""
 
 
 def turns(discretisation: Discretisation) -> Callable[..., Any]:
@@ -88,7 +89,7 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of density, of speed (at rest with derivative 0), and of vorticity given c; ``factor`` is mu."""
+    """Make the kernels of density, of speed, and of vorticity."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"quantities_{kind}_{precision.name}") for kind in ("forward", "tangent", "derivative")]
 
@@ -109,7 +110,7 @@ def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
 @cache
 def wall_force_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the forces f on walls, given the sums A, a and B as ``push``, ``rub`` and ``by_images``."""
+    """Make the kernels of the forces of particles on walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     @TypesByName(real, {vector: "push rub by_images"})
@@ -123,8 +124,7 @@ def wall_force_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def load_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of a particle's contribution to the load on a solid with a ``middle``; periodic arms are
-    shortest."""
+    """Make the kernels of the force and torque of a particle on a solid."""
     real, vector = precision.real, precision.vector
     module, derivative = (kernel_module(f"{name}_{precision.name}") for name in ("load", "load_derivative"))
     numbers = ["cell", "period"]
@@ -184,7 +184,7 @@ def load_kernels(precision: Precision) -> Kernels:
 
 
 class OfParticles:
-    """A function of each particle's numbers, and of the circulation if its kernels ``total`` are given."""
+    """A quantity of particles, such as density, speed or vorticity."""
 
     def __init__(self, solver: ParticleSolver, kernels: Kernels, kind: Any, total: Kernels | None = None, **given: Any):
         self._kernels, self._total, self._given = kernels, total, given
@@ -214,8 +214,6 @@ class OfParticles:
 
 @dataclass(frozen=True)
 class Pressure:
-    """The pressures of a gauge."""
-
     solver: ParticleSolver
 
     def value(self, step: StepContext, p: Any) -> wp.array:
@@ -229,7 +227,7 @@ class Pressure:
 
 
 class WallLoads:
-    """The forces of particles on the walls of a ``solid``, by number, or on `ALL_WALLS`: (n,) [N]."""
+    """The forces (n,) [N] of particles on the walls of solid number ``solid``, or of `ALL_WALLS`."""
 
     def __init__(self, solver: ParticleSolver):
         self._kernels, self.cell = wall_force_kernels(solver.discretisation), solver.lattice.cell
@@ -271,7 +269,6 @@ class WallLoads:
             action.adjoint(step, bar.of, solid, self._bars["rub_bar"], bar.v_star)
 
     def twists(self, step: StepContext, solid: int) -> wp.array:
-        """Return sums of y x a over wall forces, which act at x_i - y; times m_i s^d they are torques [N m]."""
         return self._total("twist", [action.total(step, solid) for action in self._twists])
 
     def twists_tangent(self, step: StepContext, along: Tangents, solid: int) -> wp.array:
@@ -300,8 +297,7 @@ class WallLoads:
 
 
 class SolidLoads:
-    """The load on a solid, F = sum_i f_i and T = sum_i r_i x f_i, where r_i points from the solid's middle at the end
-    of the step to particle i, or for viscosity as a stress to the surface beneath particle i."""
+    """The force on a solid, and its torque about the middle of the solid."""
 
     def __init__(self, loads: WallLoads, solver: ParticleSolver, solid: NamedSolid):
         vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number
@@ -314,7 +310,6 @@ class SolidLoads:
 
     @cached_property
     def _each(self) -> dict[str, wp.array]:
-        """Allocate the particles' contributions on first use, as most runs have no loads."""
         return self._layout.arrays(load=SIX, load_dot=SIX)
 
     @cached_property

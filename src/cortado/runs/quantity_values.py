@@ -1,4 +1,4 @@
-"""Quantities of particles by name, with derivatives, computed from a state and the parameters of the next step."""
+"""Quantities of particles by name, with derivatives, for a state and the parameters of the next step."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -32,19 +32,19 @@ Given = Mapping[str, NDArray]
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A state, and the parameters of the step that begins at it. Quantities are computed on first use."""
+    """A state, and the parameters of the step after it. Quantities are computed on first use."""
 
     state: State
     parameters: Mapping[str, NDArray]
-    """Parameters of the step by name; the first axis is over the scenes of a batch, or has length 1."""
+    """Parameters of the step by name, with a first axis for the scenes of a batch."""
     substeps: int
     row: int
-    """Number of the step in its run; after the last step, the number of steps."""
+    """Number of the step in its run, from 0. For the last state it is the number of steps."""
     evaluator: Callable[[], "QuantityEvaluator"]
     wanted: set[str] = field(default_factory=set)
-    """Quantities read so far, shared by the moments of a run, so that one step computes all that need a step."""
+    """Names of the quantities that were read so far. All moments of a run share this set."""
     counts: list[Counts] = field(default_factory=list)
-    """Iteration counts of the step's loops; empty before the run has taken the step."""
+    """Iteration counts of the step. The list is empty if the run has not taken the step."""
     _values: Arrays = field(default_factory=dict)
 
     @classmethod
@@ -56,7 +56,7 @@ class Moment:
         evaluator: Callable[[], "QuantityEvaluator"],
         wanted: set[str] | None = None,
     ) -> "Moment":
-        """Make the moment after ``step`` steps of a rollout; after the last step with the parameters of `row_of`."""
+        """Make the moment after ``step`` steps of a rollout."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
@@ -64,7 +64,7 @@ class Moment:
         return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
-        """Return a quantity of the state: float64, read-only, in a batch with a first axis over the scenes."""
+        """Return a quantity of the state, a read-only float64 array. For a batch, the first axis counts the scenes."""
         if name not in self._values:
             self.wanted.add(name)
             names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
@@ -80,13 +80,13 @@ class Moment:
         return self.evaluator().adjoint(bars, self)
 
     def tangents(self, names: list[str], dot: Given, parameters_dot: Given) -> Arrays:
-        """Return tangents of quantities along tangents of the state's fields and of the step's parameters."""
+        """Return tangents of quantities, given tangents of the state's fields and of the step's parameters."""
         return self.evaluator().tangents(names, self, dot, parameters_dot)
 
 
 STRESS = "pressure"
 OF_PRESSURE = {STRESS, "wall_force"}
-"""Quantities of particles that need the pressure solve of the step; others only need neighbours."""
+"""Quantities that depend on the pressure in the step."""
 
 
 def _needs_the_step(name: str) -> bool:
@@ -94,11 +94,14 @@ def _needs_the_step(name: str) -> bool:
 
 
 class QuantityEvaluator:
-    """Computes quantities of states, with tangents and adjoints, in the arrays of a solver that no run uses meanwhile.
-    Arrays are in the scene's order, in a batch with a first axis over the scenes."""
+    """Computes quantities of states, with tangents and adjoints, in the arrays of a solver. No run may use the solver
+    meanwhile.
+
+    Arrays are in the order of the scene. For a batch, the first axis counts the scenes.
+    """
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
-        """Raise `InputError` for a solver without particles."""
+        """Take a solver. Raises `InputError` for a solver without particles."""
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene is no ParticleSolver, so that quantities cannot be computed.")
         self.solver, self.dimension = solver, scene.dimension
@@ -108,9 +111,7 @@ class QuantityEvaluator:
         self._formulas = {**formulas(solver, circulation_factor), **spring_loads(solver)}
         self._counts: Counts = ()
         self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}
-        """Captured adjoints of pressures, by the solver's generation and the step's iteration counts."""
         self._rounds: list[int] = []
-        """(members,) iteration counts of each scene"""
 
     @property
     def turn(self) -> Turn:
@@ -170,7 +171,6 @@ class QuantityEvaluator:
         return self._found(adjoint, state_bar)
 
     def _from_stress(self, stress_bar: NDArray, moment: Moment) -> tuple[Arrays, Arrays]:
-        """Compute `adjoint` of pressures that a gauge would read, with a captured graph."""
         solver, (given, _, state_bar), adjoint = self.solver, self._of_stress, self._pressure_adjoint
         self._set(moment)
         if not moment.counts:
@@ -213,7 +213,7 @@ class QuantityEvaluator:
         return wanted
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
-        """Find neighbours, and take the step if a quantity needs it; with ``replay`` prepare derivatives."""
+        """Find neighbours, and take the step if a quantity needs the pressure."""
         self._set(moment)
         if any(map(_needs_the_step, names)):
             return self._solve(replay)
@@ -233,7 +233,6 @@ class QuantityEvaluator:
         self.solver.set_substeps(moment.substeps)
 
     def _solve(self, replay: bool) -> tuple[StepContext, wp.array]:
-        """Take the step, and return it with the pressures that particles exert on walls."""
         solver, rollout = self.solver, self._rollout
         rollout.forward(keep=False)
         found = solver.pressures()
@@ -258,7 +257,6 @@ class QuantityEvaluator:
 
     @cached_property
     def _pressure_adjoint(self) -> Any:
-        """Make a `PressureAdjoint` with adjoints ``bar`` within the step."""
         return self.solver.adjoint(1)
 
     @property
@@ -274,7 +272,7 @@ class QuantityEvaluator:
         return self._by_scene(found[:, 2] if name == "vorticity" and self.dimension == 2 else found)
 
     def of_scene(self, name: str, values: NDArray) -> NDArray:
-        """Return a quantity in the scene's order, or a load (6,), in the form of `values`."""
+        """Return a quantity in the order of the scene, or a load (6,)."""
         found = values.astype(np.float64)
         found.flags.writeable = False
         return self._load(found) if is_load(name) else self._by_scene(found)
@@ -288,7 +286,6 @@ class QuantityEvaluator:
         return own if batch is None else own.reshape(batch, -1, *own.shape[1:])
 
     def _sorted(self, name: str, values: NDArray) -> wp.array:
-        """Return the adjoint of a quantity on the device, in the order of sorted particles."""
         given, layout = np.asarray(values, dtype=np.float64), self.solver.layout
         if is_load(name):
             six = np.zeros((layout.members, 6))
@@ -303,8 +300,8 @@ class QuantityEvaluator:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """Return one row of parameters over time, and other parameters unchanged. After the last step values stay constant,
-    but paths of solids are extrapolated, as solids would otherwise stop."""
+    """Return the values of parameters in a time step. The first ``row`` is 0. After the last step, values stay
+    constant, but paths of solids are extrapolated."""
     found = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value) or {}
@@ -314,7 +311,8 @@ def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
 
 
 def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
-    """Add the adjoint of one row of a parameter to the adjoint ``total`` of all rows: the transpose of `row_of`."""
+    """Add the adjoint of a parameter in one time step to the adjoint ``total`` of all time steps. This is the transpose
+    of `row_of`."""
     shares = _shares_of_rows(rollout, name, row, total)
     if shares is None:
         total += bar
@@ -324,7 +322,8 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return factors by number of row, whose weighted sum is the wanted row; None for a time-independent parameter."""
+    """Return the weights of time steps in the value of `row_of`, by step number, or None for a parameter that is
+    constant in time."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None

@@ -1,4 +1,4 @@
-"""Choose the frames of a run, and read states, quantities and sensors during the run."""
+"""Chooses the frames of a run, and reads states, quantities and sensors during the run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,23 +30,23 @@ from cortado.scene.scene import Scene
 
 @dataclass(frozen=True)
 class EverySteps:
-    """Frames at every ``steps``-th state, besides the first and the last state."""
+    """Frames at every ``steps``-th state, with the first and the last state."""
 
     steps: int
     rate: ClassVar[None] = None
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the settings that must be unchanged when a run is resumed."""
+        """Return the settings that a resumed run must not change."""
         return {"record_every": self.steps}
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Test whether the state after ``step`` steps is recorded as a frame. ``now`` is its time, ``before`` the time
-        of the state one step earlier [s since the start]."""
+        """Test if the state after ``step`` steps is recorded. ``now`` is its time [s], and ``before`` the time of the
+        previous state [s]."""
         return step % self.steps == 0
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """Return times (frames,) [s] of the greatest possible number of frames, exact or estimated."""
+        """Return the expected times (frames,) [s] of all possible frames."""
         recorded = np.array([*range(0, rollout.steps, self.steps), rollout.steps])
         clock = Clock(rollout.clocks[0].steps, rollout.clocks[0].time)  # as steps of one length go on from the first
         return clock.times(recorded, float(rollout.time_steps[0]))
@@ -55,14 +55,15 @@ class EverySteps:
         return expected_frames(rollout, self.steps)
 
     def count(self, steps: int, time: float | None) -> int:
-        """Return the number of frames of ``steps`` equal steps over ``time`` [s]; None if the time must be known."""
+        """Return the number of frames in ``steps`` equal steps over ``time`` [s], or None if a needed time is
+        missing."""
         return 1 + -(-steps // self.steps)
 
 
 @dataclass(frozen=True)
 class FramesPerSecond:
-    """Frames at the first state at or after each due time, besides the first and the last state; ``rate`` [1/s]. Raise
-    `InputError` unless the rate is positive and finite."""
+    """Frames at the first state at or after each due time, with the first and the last state. ``rate`` [1/s] is the
+    number of frames per second. Raises `InputError` unless the rate is positive and finite."""
 
     rate: float
 
@@ -98,14 +99,15 @@ FrameChoice = EverySteps | FramesPerSecond
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryBatch(Sequence[Trajectory]):
-    """The trajectories of a batch of runs: ``batch[b]`` is the `Trajectory` of scene b, with the bits of its single
-    run. If scene b lost a particle, its trajectory ends before."""
+    """The trajectories of a batch of runs. ``batch[b]`` is the `Trajectory` of scene b, with exactly the numbers of a
+    run of this scene alone. If scene b lost a particle, its trajectory ends before the loss."""
 
     trajectories: tuple[Trajectory, ...]
     fields: Mapping[str, NDArray[Any]]
-    """(frames, batch, ...) every field that steps change, by name; NaN after the last frame of a lost scene"""
+    """Fields that change over time, by name, (frames, batch, ...). After the last frame of a lost scene they
+    are NaN."""
     lost: Mapping[int, DivergedError]
-    """Errors of the scenes that lost a particle, by the number of the scene."""
+    """Errors of the scenes that lost a particle, by scene number."""
 
     def __repr__(self) -> str:
         lost = f", {len(self.lost)} lost" if self.lost else ""
@@ -137,7 +139,7 @@ class TrajectoryBatch(Sequence[Trajectory]):
 
     @property
     def mass_fractions(self) -> NDArray[Any] | None:
-        """Return the mass fractions (frames, batch, n, phases) [-]; None with one phase."""
+        """Return the mass fractions (frames, batch, n, phases) [-], or None for a single phase."""
         return self.fields.get("mass_fractions")
 
 
@@ -150,8 +152,11 @@ def recorded(
     quantities: Arrays,
     readings: Callable[[int], Mapping[str, Readings]],
 ) -> Trajectory | TrajectoryBatch:
-    """Make the trajectory of a rollout from ``fields`` and ``quantities`` (frames, ...), in a batch (frames, batch,
-    ...), after ``steps`` (frames,) steps. ``readings`` returns the readings of a scene's sensors."""
+    """Make the trajectory of a rollout from ``fields`` and ``quantities`` of frames after ``steps`` (frames,) steps.
+
+    Arrays have the shape (frames, ...), or (frames, batch, ...) for a batch. ``readings`` returns the sensor readings
+    of a scene.
+    """
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -186,12 +191,10 @@ def recorded(
 
 
 MOST = 2**28
-"""Size [bytes] of waiting copies above which they are read at once."""
+"""Greatest size of copied states that are not yet read [bytes]."""
 
 
 class _Poses(dict[str, NDArray[Any]]):
-    """A state for sensors that contains only the poses of solids."""
-
     def __init__(self, scene: QuantityEvaluator, fields: Mapping[str, NDArray[Any]]):
         super().__init__(fields)
         self.dimension, self.lattice = scene.dimension, scene.lattice
@@ -207,7 +210,7 @@ def kept_by_steps(scene: QuantityEvaluator, rollout: Rollout, names: tuple[str, 
 
 class QuantityReader:
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, wanted: Mapping[int, str]):
-        """``wanted`` are names of quantities by the number of the state."""
+        """Read quantities during a run. ``wanted`` maps the number of a state to the name of a quantity."""
         self.found: dict[int, Arrays] = {}
         self.beside = kept_by_steps(scene, rollout, tuple(sorted(set(wanted.values()))))
         self._scene, self._wanted = scene, wanted
@@ -219,8 +222,7 @@ class QuantityReader:
 
 
 class StepReader:
-    """A `ChunkReader` of sensors: it sums over particles on the device; `look` writes readings into ``logs``, one per
-    scene."""
+    """A `ChunkReader` of sensors, which sums over particles on the device."""
 
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, sensors: dict[str, Summed], logs: list[SensorLog]):
         self.sensors, self._scene, self._rollout, self._logs = sensors, scene, rollout, logs
@@ -240,7 +242,6 @@ class StepReader:
         )
         self._is_ready = wp.Event(first.positions.device) if first.positions.device.is_cuda else None
         self._step = self._count = 0
-        """First state of the last chunk, and number of its states that `look` must still read."""
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
         self.look()
@@ -255,7 +256,6 @@ class StepReader:
             first.positions.device.stream.record_event(self._is_ready)
 
     def look(self) -> None:
-        """Write the readings of the last chunk into the logs."""
         if self._is_ready is not None and self._count:
             wp.synchronize_event(self._is_ready)
         count, self._count = self._count, 0
@@ -284,10 +284,10 @@ class StepReader:
 
 
 class Waiting:
-    """A queue of copies of states in pinned host memory, which an observer fills and `look` empties."""
+    """A queue of copies of states in pinned host memory."""
 
     def __init__(self, look: Callable[[int, State], None], first: State, copies: list[State]):
-        """``look`` receives the number and the copy of each state; ``first`` is a state; ``copies`` are reused."""
+        """Call ``look`` with the number and the copy of each state. ``copies`` are buffers, which are reused."""
         self._look, self._device = look, first.positions.device
         names = [field.name for field in first.fields if field.is_constant]
         self._constant = {name: copies[0][name] if copies else _empty(first[name]) for name in names}
@@ -298,7 +298,7 @@ class Waiting:
         self._most = max(MOST // sum(array.capacity for array in first.arrays()), 1)
 
     def keep(self, number: int, state: State) -> None:
-        """Copy a state; on a GPU without waiting for launched kernels."""
+        """Copy a state without waiting for the GPU."""
         if len(self._numbers) == len(self._copies):
             own = {n: self._constant[n] if n in self._constant else _empty(state[n]) for n in state.names}
             self._copies.append(State(state.fields, own, state.batch))
@@ -321,8 +321,6 @@ class Waiting:
 
 
 class Table:
-    """Arrays by name with one row per record. Memory grows by doubling."""
-
     def __init__(self, expected: int):
         self._rows, self._count, self._arrays = expected, 0, dict[str, NDArray]()
 

@@ -1,4 +1,4 @@
-"""The folder of one run: its scene, versions and command, metrics, trajectory and pictures."""
+"""The folder of a run with its scene, versions, command, metrics, trajectory and pictures."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FIGURES = (
     *(f"{name}.png" for name in (*_PLOTS, *NAMES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
     *(f"{name}.mp4" for name in _FILMS),
 )
-"""Names of all files that runs write into the folder of figures; other files in it belong to the user."""
+"""Names of the figures that runs write. Other files belong to the user."""
 TO_RESUME = "; choose another --out, or begin one without --resume"
 
 
@@ -51,8 +51,11 @@ class _Entry:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Paths and files of one run. The file environment.json marks a run folder: it is written first and removed last,
-    so that a killed process leaves a folder that can be overwritten or resumed."""
+    """The folder and files of one run.
+
+    The file environment.json marks a run folder. It is written first and removed last, so that the folder of a killed
+    process can be overwritten or resumed.
+    """
 
     path: Path
     scene = _Entry("scene.json")
@@ -64,7 +67,7 @@ class RunFolder:
     figures = _Entry("figures")
     report = _Entry("report.html")
     result = _Entry("result.json")
-    """File that exists only if the run has ended."""
+    """File that exists only after the end of the run."""
 
     @classmethod
     def create(
@@ -78,10 +81,13 @@ class RunFolder:
         device: str = "",
         overwrite: bool = False,
     ) -> Self:
-        """Make the folder of a new run. ``kind`` is the command that may resume it, with the same ``settings``;
-        ``device`` is text; ``overwrite`` removes the files of an earlier run. Raise `InputError` if the folder contains
-        a run or other files that a run would replace, or is not writable, and `ComputationError` if the disk is
-        full."""
+        """Make the folder of a new run. ``kind`` is the name of the command, and ``settings`` are its settings; a
+        resumed run must have the same kind and settings. ``device`` is a description. ``overwrite`` removes the files
+        of an earlier run.
+
+        Raises `InputError` if the folder is not writable, or contains a run or other files that the run would replace.
+        Raises `ComputationError` if the disk is full.
+        """
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
         named = files_named(json.loads(scene_json))
@@ -94,7 +100,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of one") -> Self:
-        """Open the folder of a run; raise `InputError`, which ends with ``otherwise``, if there is none."""
+        """Open the folder of a run. Raises `InputError` if there is no run. The message ends with ``otherwise``."""
         folder = cls(Path(path).absolute())
         if not folder._holds_run():
             raise InputError(f"There is no run in {folder.path}{otherwise}.")
@@ -111,8 +117,8 @@ class RunFolder:
         settings: Mapping[str, Any] | None = None,
         device: str = "",
     ) -> Self:
-        """Open the folder of a run, and add this process to environment.json; arguments are as in `create`. Raise
-        `InputError` if there is no run, or one of another kind, scene or settings."""
+        """Open the folder of a run, and add this process to environment.json. Arguments are as in `create`. Raises
+        `InputError` if there is no run, or if its kind, scene or settings differ."""
         folder = cls.open(path, TO_RESUME)
         folder.require(scene_json, kind, settings)
         noted = read_json(folder.environment)
@@ -126,7 +132,7 @@ class RunFolder:
         return folder
 
     def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
-        """Raise `InputError`, which names the difference, unless the run has this kind, scene and settings."""
+        """Raise `InputError` unless the run has the given kind, scene and settings."""
         noted = read_json(self.environment)
         former = noted.get("kind", kind)
         if former != kind:
@@ -154,11 +160,11 @@ class RunFolder:
             write_atomically(self.sensors, as_csv(readings))
 
     def read_sensors(self) -> dict[str, Readings]:
-        """Read sensors.csv with the exact numbers of the run; empty if there is no file."""
+        """Read sensors.csv without loss of digits. Return an empty table if the file does not exist."""
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """Read the scene with ``overrides``, without its warnings; raise `InputError` for a damaged file or a wrong
+        """Read the scene with ``overrides``, without warnings. Raises `InputError` for a damaged file or an invalid
         override."""
         text = bytes_of(self.scene).decode(errors="replace")
         with unwarned():
@@ -174,7 +180,7 @@ class RunFolder:
         return read_json(self.result) if self.result.exists() else None
 
     def append_metrics(self, **values: Any) -> None:
-        """Append one line to metrics.jsonl; a process killed afterwards does not lose it."""
+        """Append a line to metrics.jsonl. The line is kept if the process is killed afterwards."""
         line = json.dumps(values, default=plain) + "\n"
         with sentences(self.metrics), open(self.metrics, "a", encoding="utf-8") as file:
             file.write(line)
@@ -185,7 +191,7 @@ class RunFolder:
         write_atomically(self.metrics, "".join(lines))
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """Read the lines of metrics.jsonl, without an unfinished last line; raise `InputError` for a damaged line."""
+        """Read the lines of metrics.jsonl, without an unfinished last line. Raises `InputError` for a damaged line."""
         if not self.metrics.exists():
             return []
         try:
@@ -242,12 +248,11 @@ class RunFolder:
                 path.unlink(missing_ok=True)
 
     def _checkpoints(self) -> list[Path]:
-        """Return the folders of all searches of the run, the outer folder last."""
         return [*self.checkpoint.glob("[0-9]*/"), self.checkpoint]
 
 
 def computed(scene: Any) -> Any:
-    """Return a scene without the tables that only affect pictures and readings."""
+    """Return a scene without the tables for pictures and readings."""
     shown = ("picture", "sensor")
     return {name: table for name, table in scene.items() if name not in shown} if isinstance(scene, dict) else scene
 
@@ -261,7 +266,7 @@ def finite(value: Any) -> Any:
 
 
 def bytes_of(path: Path) -> bytes:
-    """Read a file; raise `InputError` if it is not a regular file or is too large."""
+    """Read a file. Raises `InputError` if it is not a regular file or is too large."""
     try:
         return content(path, LARGEST)
     except OSError as problem:
@@ -299,7 +304,7 @@ def as_json(value: Any) -> Any:
 
 
 def require_same(former: Any, given: Any, folder: Path) -> None:
-    """Raise `InputError`, which names the field, if settings differ from those of the run in a folder."""
+    """Raise `InputError` if settings differ from the settings of the run in a folder. The message names the setting."""
     for name, (before, now) in sorted(differences(former, given).items()):
         field = ".".join(part if not part.isdigit() else f"[{part}]" for part in name.split(".")).replace(".[", "[")
         raise InputError(
@@ -309,7 +314,7 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
-    """Return pairs of the values that differ, by dotted names; an absent entry counts as ``missing``."""
+    """Return pairs of different values by dotted name. ``missing`` replaces an absent value."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}
     elif _are_tables(one) and _are_tables(other) and len(one) == len(other):

@@ -1,4 +1,4 @@
-"""The interface of sensors; readings over a run, as arrays and as a file; and comparison with measured data."""
+"""The interface of sensors, the readings of a run, and the comparison with measured data."""
 
 import csv
 import io
@@ -25,7 +25,7 @@ class Cut(Protocol):
 
     @property
     def lattice(self) -> Lattice:
-        """Return the constants of the rest lattice, such as a particle's volume and the periodic axes."""
+        """Return the constants of the rest lattice, such as the volume of a particle and the periodic axes."""
 
 
 class SensedScene(Cut, Protocol):
@@ -38,37 +38,37 @@ class SensedScene(Cut, Protocol):
 
 
 class Reading(SensedScene, Protocol):
-    """A state from which sensors read: a `cortado.losses.Snapshot`."""
+    """Protocol of a state for sensors, such as `cortado.losses.Snapshot`."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return a field of the state or a quantity of its particles, float64."""
+        """Return a field of the state, or a quantity of its particles, as a float64 array."""
 
 
 class Sensor(Protocol):
-    """A sensor that computes a few numbers from a state, with their derivatives."""
+    """Protocol of sensors, which compute a few numbers from a state, with derivatives."""
 
     def columns(self, dimension: int) -> dict[str, str]:
-        """Return the names of the sensor's numbers, with their units."""
+        """Return the units of the sensor's numbers by name."""
 
     def value(self, at: Reading) -> NDArray[Any]:
-        """Return the sensor's reading (k,) of a state, one number for each column."""
+        """Return the reading (k,) of a state, with one number for each of `columns`."""
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert the adjoint (k,) of the reading to adjoints of fields and quantities, by name."""
+        """Convert the adjoint ``bar`` (k,) of the reading to adjoints of fields and quantities by name."""
 
 
 TIME = "time [s]"
 
 
 def named(what: str, name: Any, of: str) -> str:
-    """Return the name of something ``of`` a scene; raise `InputError` for anything but a text."""
+    """Return the name of an object. Raises `InputError` unless it is a text."""
     if not isinstance(name, str) or not name:
         raise InputError(f"{what} is {shown(name)}, but must be the name of a {of}.")
     return name
 
 
 def point(what: str, values: Any) -> NDArray[Any]:
-    """Return a finite place or direction (d,); raise `InputError` for anything else."""
+    """Return a finite position or direction (d,). Raises `InputError` for invalid values."""
     array = corner(what, values)
     if not np.isfinite(array).all():
         raise InputError(f"{what} is {array.tolist()}, but must be finite.")
@@ -76,7 +76,7 @@ def point(what: str, values: Any) -> NDArray[Any]:
 
 
 def corner(what: str, values: Any) -> NDArray[Any]:
-    """Return the corner (d,) of a region, whose unbounded sides are infinite; raise `InputError` for anything else."""
+    """Return the corner (d,) of a region, whose components may be infinite. Raises `InputError` for invalid values."""
     array = read_only(what, values)
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
@@ -86,7 +86,7 @@ def corner(what: str, values: Any) -> NDArray[Any]:
 
 
 def direction(what: str, values: Any) -> NDArray[Any]:
-    """Return a direction (d,) scaled to length 1; raise `InputError` for anything else."""
+    """Return a direction (d,) scaled to length 1. Raises `InputError` for invalid values."""
     array = point(what, values)
     if not array.any():
         raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
@@ -94,7 +94,7 @@ def direction(what: str, values: Any) -> NDArray[Any]:
 
 
 def positive(what: str, value: Any) -> float:
-    """Return a finite number above 0; raise `InputError` for anything else."""
+    """Return a finite positive number. Raises `InputError` for invalid values."""
     number = as_one_number(what, value)
     if not 0.0 < number < np.inf:
         raise InputError(f"{what} is {number:g}, but must be greater than 0 and finite.")
@@ -107,7 +107,7 @@ def checked_sensor(sensor: Any) -> Sensor:
 
 
 def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict[str, Sensor]:
-    """Return sensors by name; raise `InputError` for names in ``taken`` and for objects that are no sensors."""
+    """Return sensors by name. Raises `InputError` for names in ``taken``, and for objects that are not sensors."""
     if given is None:
         return {}
     require_table("sensors", given, "{'gauge': sensor}")
@@ -120,7 +120,7 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
 
 
 def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
-    """Return the reading (k,) of a sensor; raise `InputError` unless it has one number for each column."""
+    """Return the reading (k,) of a sensor. Raises `InputError` unless it has one number for each column."""
     what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
     found = as_numbers(what, sensor.value(at))
     if found.shape != (columns,):
@@ -129,7 +129,7 @@ def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
 
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return a place with one component for each dimension of the scene; raise `InputError` for any other."""
+    """Return a vector of the scene's dimension. Raises `InputError` for a wrong length."""
     if len(values) != dimension:
         raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
     return values
@@ -140,17 +140,17 @@ class Readings:
     """The readings of one sensor over time."""
 
     times: NDArray[Any]
-    """(readings,) [s]"""
+    """Times of the readings (readings,) [s]."""
     values: NDArray[Any]
-    """(readings, k)"""
+    """Readings (readings, k), with one column for each number of the sensor."""
     units: Mapping[str, str]
-    """units of the sensor's numbers by name, in column order"""
+    """Units of the sensor's numbers by name, in the order of the columns."""
 
     def __repr__(self) -> str:
         return f"Readings({len(self.times)} of {', '.join(self.units)})"
 
     def __getitem__(self, column: str) -> NDArray[Any]:
-        """Return one number of the sensor over time, (readings,), by name; raise `InputError` for an unknown name."""
+        """Return one number of the sensor over time, (readings,). Raises `InputError` for an unknown name."""
         if column not in self.units:
             raise InputError(f"a column is {shown(column)}, but must be one of {', '.join(self.units)}.")
         return self.values[:, list(self.units).index(column)]
@@ -166,7 +166,8 @@ class SensorLog:
         self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
 
     def read(self, name: str, number: int, reading: Callable[[], NDArray[Any]]) -> None:
-        """Store a reading (k,) of state ``number``, unless it is known; NaN if the next step loses a particle."""
+        """Store the reading (k,) of state ``number``, unless it is already stored. It is NaN if the next step loses a
+        particle."""
         if number == len(self._rows[name]):
             try:
                 self._rows[name].append(reading())
@@ -174,7 +175,7 @@ class SensorLog:
                 self._rows[name].append(np.full(len(self._units[name]), np.nan))
 
     def known(self, readings: Mapping[str, Readings]) -> float:
-        """Return the last step for which all sensors have ``readings``; infinite without sensors."""
+        """Return the number of the last state with readings of all sensors, or infinity without sensors."""
         if any(name not in readings or readings[name].units != self._units[name] for name in self.sensors):
             return -1
         return min((len(readings[name].times) - 1 for name in self.sensors), default=inf)
@@ -183,7 +184,7 @@ class SensorLog:
         self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
-        """Return the readings of all states that every sensor has read, given their ``times`` [s]."""
+        """Return the readings of all states that were read, given the ``times`` [s] of the states."""
         count = min(map(len, self._rows.values()), default=0)
         found = {}
         for name, units in self._units.items():
@@ -204,7 +205,7 @@ def as_csv(readings: Mapping[str, Readings]) -> str:
 
 
 def from_csv(path: Path) -> dict[str, Readings]:
-    """Read a file written with `as_csv`; raise `InputError` for any other file."""
+    """Read a file written by `as_csv`. Raises `InputError` for any other file."""
     columns = read_columns(path)
     times, found = columns.pop(TIME, np.zeros(0)), dict[str, dict[str, str]]()
     if not len(times):
@@ -224,7 +225,8 @@ Summary = dict[str, dict[str, dict[str, float]]]
 
 
 def summary(readings: Mapping[str, Readings]) -> Summary:
-    """Return for each number the last reading, the mean over time, and the reading with the greatest absolute value."""
+    """Return the last reading, the mean over time, and the reading with the greatest absolute value, for each number of
+    each sensor."""
     return {name: {column: _of(own, column) for column in own.units} for name, own in readings.items()}
 
 
@@ -239,21 +241,21 @@ def _of(read: Readings, column: str) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredColumn:
-    """Measured values for one number of a sensor, and simulated values at the same times."""
+    """Measured and simulated values of one number of a sensor."""
 
     name: str
-    """"gauge.height" for the number height of the sensor gauge"""
+    """Name of the sensor and its number, such as "gauge.height"."""
     unit: str
     times: NDArray[Any]
     values: NDArray[Any]
-    """(k,)"""
+    """Measured values (k,)."""
     simulated: NDArray[Any]
-    """(k,) readings of the sensor, linearly interpolated between steps"""
+    """Readings of the sensor at the same times (k,), linearly interpolated."""
     left_out: int
 
     @property
     def errors(self) -> dict[str, float]:
-        """Return errors of simulated minus measured values, in the sensor's unit."""
+        """Return measures of the difference between simulated and measured values, in the unit of the sensor."""
         off = self.simulated - self.values
         worst = int(np.abs(off).argmax())
         return {
@@ -265,9 +267,12 @@ class MeasuredColumn:
 
 
 def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
-    """Read a table of measured data, and pair each column with the readings of a sensor. The table has a column "time"
-    [s] and columns such as "gauge.height", named as in sensors.csv. Units in brackets may be left out, and entries may
-    be empty. Raise `InputError` for another table or unit, an unknown sensor, and if no point is within the run."""
+    """Read a table of measured data, and pair each column with the readings of a sensor.
+
+    The table has a column "time" [s] and columns such as "gauge.height", with names as in sensors.csv. Units in
+    brackets may be left out, and entries may be empty. Raises `InputError` for an invalid table, a wrong unit, an
+    unknown sensor, or a table without points during the run.
+    """
     columns = read_columns(path)
     named = {name_and_unit(head): values for head, values in columns.items()}
     times = named.get(("time", "s"), named.get(("time", None)))
@@ -300,8 +305,8 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
 def measured_columns(
     path: Path, units: Mapping[str, str], own: str = "", sensors: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table, (lines,) by name, without those of other ``sensors`` than ``own``. Names may begin
-    with ``own`` and end with a unit. Raise `InputError` for a column in another unit, or twice."""
+    """Return the columns of a table by name, (lines,). Columns of ``sensors`` other than ``own`` are left out. Names
+    may begin with ``own`` and end with a unit. Raises `InputError` for a wrong unit or a repeated column."""
     found: dict[str, NDArray[Any]] = {}
     for head, values in read_columns(path).items():
         name, unit = name_and_unit(head)

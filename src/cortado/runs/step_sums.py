@@ -1,5 +1,8 @@
-"""Values that sensors read on the device during a run. Steps store quantities; after a chunk of steps, the sums of
-`cortado.runs.particle_sums` are launched for all its states, in float64 and in fixed order."""
+"""Sums over particles for sensors, computed on the device during a run.
+
+After a chunk of steps, the sums of `cortado.runs.particle_sums` are computed for all states of the chunk, in float64
+and in a fixed order.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
@@ -29,8 +32,6 @@ from cortado.sph.parts import unsort
 
 @wp.struct
 class _Around:
-    """A sensor's place and projection in three dimensions; see `Domain.ways` and `Weights`."""
-
     place: wp.vec3d
     lower: wp.vec3d
     lengths: wp.vec3d
@@ -46,8 +47,6 @@ class _Around:
 
 @wp.struct
 class _Region:
-    """A region in three dimensions; see `Domain.within`."""
-
     start: wp.vec3d
     lengths: wp.vec3d
     lower: wp.vec3d
@@ -57,8 +56,6 @@ class _Region:
 
 @wp.struct
 class _Ride:
-    """A point that a solid carries, and the solid's R_0^T."""
-
     arm: wp.vec3d
     own: wp.mat33d
     turns: int
@@ -66,8 +63,6 @@ class _Ride:
 
 @cache
 def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make kernels of the place to which a solid carries a point, and of the matrix back to the solid's initial
-    axes."""
     angle, of = rotations(precision, dimension).angle, rotations(FLOAT64, dimension)
     module = kernel_module(f"sensors_on_solids_{precision.name}_{dimension}")
     wide = wp.float64 if dimension == 2 else wp.vec3d
@@ -100,7 +95,6 @@ def _rides(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def _kernels(precision: Precision) -> SimpleNamespace:
-    """Make kernels of partial sums over the particles of each state with a fixed stride, and of their total."""
     real, vector = precision.real, precision.vector
     module, numbers = kernel_module(f"particle_sums_{precision.name}"), wp.array(dtype=real)
 
@@ -116,7 +110,7 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def placed(x: vector, start: wp.vec3d, lengths: wp.vec3d) -> wp.vec3d:
-        """Return the periodic image of a particle that lies in the period beginning at ``start``."""
+        """Return the periodic image of a particle in the periodic box with the lower corner ``start``."""
         y = doubled(x)
         for k in range(3):
             if lengths[k] > wp.float64(0.0):
@@ -135,7 +129,7 @@ def _kernels(precision: Precision) -> SimpleNamespace:
     def weight(
         a: _Around, x: vector, row: int, places: wp.array(dtype=wp.vec3d), views: wp.array(dtype=wp.mat33d)
     ) -> wp.float64:
-        """Return the weight of a particle: the mean over its parts, summed over their periodic images."""
+        """Return the weight of a particle, averaged over its parts and summed over periodic images."""
         y = placed(x, a.lower, a.lengths)
         way = y - a.place
         if places.shape[0] > 0:
@@ -207,13 +201,13 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
 
 class StepQuantities:
-    """Quantities and loads that each step of a chunk computes for its initial state."""
+    """Quantities and loads for each step of a chunk."""
 
     def __init__(self, formulas: Mapping[str, QuantityFormula], solver: ParticleSolver, length: int):
         self._formulas, self._solver, self._length, self.kept = formulas, solver, length, dict[str, wp.array]()
 
     def launch(self, step: int, parameters: Parameters) -> None:
-        """Launch the formulas for the last step of the solver, number ``step`` of the chunk."""
+        """Launch the formulas of the quantities for step number ``step`` of the chunk."""
         solver, context = self._solver, self._solver.context(parameters)
         pressures = solver.pressures()
         if pressures is None:
@@ -229,16 +223,16 @@ class StepQuantities:
                 unsort(context, found, own)
 
     def of_step(self, name: str, step: int) -> wp.array:
-        """Return a load, or a quantity in the scene's order, of step number ``step`` of the chunk."""
+        """Return a load, or a quantity in the order of the scene, for step number ``step`` of the chunk."""
         size = len(self.kept[name]) // self._length
         return self.kept[name][step * size : (step + 1) * size]
 
 
 class CarriedRows:
-    """The places to which a solid has carried a sensor, in each state of a chunk."""
+    """The places of a sensor on a solid, in each state of a chunk."""
 
     def __init__(self, ride: Ride, point: NDArray[Any], scene: SensedScene, solver: ParticleSolver, rows: int):
-        """Allocate arrays for ``rows`` states; ``point`` (d,) is the sensor's initial place [m]."""
+        """Allocate arrays for ``rows`` states. ``point`` (d,) [m] is the initial place of the sensor."""
         table, layout = ride.table(scene), solver.layout
         self._device, self._members, self._ride = solver.device, layout.members, _Ride()
         self._ride.arm = wp.vec3d(*in_space(point - table.middle()))
@@ -268,7 +262,7 @@ class CarriedRows:
 
 
 class ChunkSums:
-    """The sums of one sensor over the particles of each state of a chunk."""
+    """The sums of one sensor over particles, for each state of a chunk."""
 
     def __init__(self, summed: ParticleSum, scene: SensedScene, solver: ParticleSolver, length: int):
         layout, self._summed, domain = solver.layout, summed, scene.lattice.domain
@@ -278,7 +272,6 @@ class ChunkSums:
         self._partial = wp.empty(rows * self._stride, dtype=SIX, device=solver.device)
         self._total = wp.zeros(rows, dtype=SIX, device=solver.device)
         self._launches: dict[tuple[int, int], list[Callable[[], None]]] = {}
-        """Launches by number of steps and address of the first state, which are the same in most chunks."""
         self._setting: Any = None
         point: NDArray[Any] | None = None
         if isinstance(summed, WeightedSum):
@@ -289,7 +282,8 @@ class ChunkSums:
         self._carried = None if ride is None or point is None else CarriedRows(ride, point, scene, solver, rows)
 
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
-        """Launch the sums over the initial states of ``count`` steps, and return them (at least count * scenes,)."""
+        """Launch the sums for the states before ``count`` steps, and return an array of sums for each state
+        and scene."""
         if isinstance(self._summed, LoadSum):
             return self._total if self._summed.quantity is None else kept[self._summed.quantity]
         key = count, first.positions.ptr
@@ -302,7 +296,6 @@ class ChunkSums:
     def _recorded(
         self, summed: ParticleSum, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]
     ) -> list[Callable[[], None]]:
-        """Return launches of the sums, whose arguments are packed only once."""
         rows = count * self._scenes
         sizes = {"particles": self._particles, "before": self._scenes * self._particles, "stride": self._stride}
         fields = {"x_first": first.positions, "x": later.whole("positions"), "a": self._setting}
@@ -339,7 +332,6 @@ def _around(summed: WeightedSum, domain: Domain, device: Any) -> Any:
 
 
 def _region(summed: RegionSum, domain: Domain) -> Any:
-    """Return a region as a struct, unbounded along the third axis in 2-D."""
     found, (start, lower, upper) = _Region(), domain.ends(summed.lower, summed.upper)
     found.start, found.about = wp.vec3d(*in_space(start)), wp.vec3d(*in_space(summed.about))
     beyond = [np.inf] * (3 - len(lower))

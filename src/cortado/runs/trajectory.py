@@ -27,23 +27,23 @@ from cortado.scene.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One recorded state of a run, ``trajectory[k]``, of n particles in d dimensions."""
+    """One recorded state of a run with n particles in d dimensions: ``trajectory[k]``."""
 
     positions: NDArray[Any]
-    """(n, d) [m]"""
+    """Positions of particles (n, d) [m]."""
     velocities: NDArray[Any]
-    """(n, d) [m/s]"""
+    """Velocities of particles (n, d) [m/s]."""
     mass_fractions: NDArray[Any] | None
-    """(n, phases) [-]; None with one phase"""
+    """Mass fractions (n, phases) [-], or None for a single phase."""
     time: float
-    """[s]"""
+    """Time of the state [s]."""
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(n,) or (n, k) recorded quantities by name, such as ``density``"""
+    """Recorded quantities by name, such as ``density``, (n,) or (n, k)."""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """further fields of the state by name; see `Trajectory`"""
+    """Further fields of the state by name; see `Trajectory`."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return a recorded quantity, the speed or a field of the state; raise `InputError` for any other name."""
+        """Return a recorded quantity, the speed or a field of the state. Raises `InputError` for unknown names."""
         return chosen(self.quantities, name, fields_of(self))
 
     def moved(self, duration: float) -> Frame:
@@ -62,7 +62,7 @@ def fields_of(of: Frame | Trajectory) -> dict[str, NDArray[Any]]:
 
 
 def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return a recorded quantity, the speed or one of ``fields``; raise `InputError` for any other name."""
+    """Return a recorded quantity, the speed or one of ``fields``. Raises `InputError` for unknown names."""
     check_quantity(name, others=tuple(fields))
     if name in fields:
         return fields[name]
@@ -87,7 +87,7 @@ class Trajectory:
     are trajectories of only these frames. ``len``, ``for`` and ``reversed`` work on the frames.
 
     Raises:
-        InputError: arrays whose shapes do not belong together.
+        InputError: the shapes of the arrays do not match.
 
     Example::
 
@@ -98,39 +98,40 @@ class Trajectory:
     """
 
     times: NDArray[Any]
-    """(frames,) [s]"""
+    """Times of frames (frames,) [s]."""
     steps: NDArray[Any]
-    """(frames,) [-] steps taken before each frame; 0 is the first state"""
+    """Number of steps before each frame (frames,) [-]; 0 for the first state."""
     positions: NDArray[Any]
-    """(frames, n, d) [m]"""
+    """Positions of particles (frames, n, d) [m]."""
     velocities: NDArray[Any]
-    """(frames, n, d) [m/s]"""
+    """Velocities of particles (frames, n, d) [m/s]."""
     diagnostics: Mapping[str, NDArray[Any]]
-    """(steps,) by name: ``converged`` and the solver's other notes; see `StepLog`"""
+    """Diagnostics of steps (steps,) by name, such as ``converged``. The names depend on the solver; see `StepLog`."""
     mass_fractions: NDArray[Any] | None = None
-    """(frames, n, phases) [-]; None with one phase"""
+    """Mass fractions (frames, n, phases) [-], or None for a single phase."""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(frames, ...) further fields of the states by name; with an emitter also ``outlet`` [m] and ``emitted`` [m], see
-    `RestartState`"""
+    """Further fields of the states by name, (frames, ...), such as ``outlet`` [m] and ``emitted`` [m] with an emitter;
+    see `RestartState`."""
     constants: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """fields that no step changes: ``reference_density`` (n,), a particle's mass over its volume on the rest lattice
-    [kg/m3], and with one phase ``mass_fractions`` (n, 1)"""
+    """Fields that are constant over time. ``reference_density`` (n,) [kg/m3] is the mass of a particle divided by its
+    volume on the rest lattice. With a single phase, ``mass_fractions`` (n, 1) are constant too."""
     substeps: int = 0
-    """[-] explicit steps of diffusion within each step"""
+    """Number of explicit diffusion substeps in each step [-]."""
     origin: Origin | None = None
-    """description of the particles' scene; None if unknown"""
+    """Description of the particles' scene, or None if unknown."""
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """(frames, n) or (frames, n, k) recorded quantities by name, such as ``density``"""
+    """Recorded quantities by name, such as ``density``, (frames, n) or (frames, n, k)."""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
-    """readings of sensors in every step, by sensor name; files do not contain them"""
+    """Readings of sensors in every step, by sensor name. Files do not contain them."""
     solids: SolidMotions = field(default_factory=SolidMotions)
-    """motions of the moving solids, by name"""
+    """Motions of moving solids by name."""
     begun: int | None = None
-    """number of steps before the first entry of ``diagnostics``, by default before the first frame [-]"""
+    """Number of steps before the first entry of ``diagnostics`` [-], by default the number of steps before the first
+    frame."""
     marks: Marks | None = None
-    """times at which frames of a run with ``--fps`` are due; None if frames are chosen by steps"""
+    """Due times of frames in a run with ``--fps``, or None if frames are chosen by steps."""
     scene: Scene | None = field(default=None, repr=False)
-    """scene of the run; None if the trajectory was read from a file"""
+    """Scene of the run, or None if the trajectory was read from a file."""
 
     def __post_init__(self) -> None:
         if self.begun is None and len(self.steps):
@@ -160,8 +161,8 @@ class Trajectory:
     def __getitem__(self, k: slice) -> Trajectory: ...
 
     def __getitem__(self, k: int | slice) -> Frame | Trajectory:
-        """Return a frame, or a trajectory of some frames with the diagnostics of the whole run. Raise `IndexError` if
-        there is no such frame, and `InputError` unless k is a whole number or a slice."""
+        """Return a frame, or a trajectory of some frames with the diagnostics of the whole run. Raises `IndexError` for
+        a missing frame, and `InputError` unless k is a whole number or a slice."""
         if isinstance(k, slice):
             return self._chosen(k)
         try:
@@ -195,7 +196,8 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """Return the times (frames,) [s] at which films show the frames: due times with ``--fps``, else ``times``."""
+        """Return the times (frames,) [s] of the frames in films. For a run with ``--fps`` they are the due times, and
+        otherwise ``times``."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
@@ -208,19 +210,19 @@ class Trajectory:
 
     @property
     def iterations(self) -> NDArray[Any]:
-        """Return the pressure iterations (steps,) [-] of each step; raise `InputError` if the solver does not record
+        """Return the pressure iterations of each step (steps,) [-]. Raises `InputError` if the solver does not record
         them."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def density_errors(self) -> NDArray[Any]:
-        """Return the average (rho - rho_0) / rho_0 (steps,) [-] of each step; raise `InputError` if it is not
-        recorded."""
+        """Return the mean relative density error (rho - rho_0) / rho_0 of each step (steps,) [-], with the density rho
+        and the rest density rho_0. Raises `InputError` if the solver does not record the error."""
         return noted(self.diagnostics, "density_errors")
 
     @property
     def converged(self) -> NDArray[Any]:
-        """Return booleans (steps,): True where the solver reached its tolerance."""
+        """Return for each step (steps,) True if the solver reached its tolerance."""
         return self.diagnostics["converged"]
 
     @property
@@ -230,8 +232,8 @@ class Trajectory:
 
     @property
     def last_state(self) -> RestartState:
-        """Return a copy of the last state, from which `Simulation.run` continues with the same bits as without a stop.
-        Raise `InputError` if there is no frame."""
+        """Return a copy of the last state. A run that `Simulation.run` continues from this state has exactly the
+        numbers of a run without interruption. Raises `InputError` if there is no frame."""
         if not len(self):
             raise InputError("The trajectory has no frame, but must have one to continue from.")
         own = {name: array.copy() for name, array in {**fields_of(self[-1]), **self.constants}.items()}
@@ -240,9 +242,11 @@ class Trajectory:
         return RestartState(own, Clock(int(self.steps[-1]), float(self.times[-1]), size), self.origin)
 
     def save(self, path: str | Path) -> None:
-        """Write a VTKHDF file, which ParaView opens; a file at this ``path`` is replaced. Raise `InputError` without
-        frames, for a name that does not end in .vtkhdf or .hdf, or if the path cannot be written, and
-        `ComputationError` if the disk is full."""
+        """Write a VTKHDF file, which ParaView opens. An existing file at ``path`` is replaced.
+
+        Raises `InputError` if there is no frame, if the name does not end in .vtkhdf or .hdf, or if the path cannot be
+        written. Raises `ComputationError` if the disk is full.
+        """
         if Path(as_path("path", path)).suffix.lower() not in SUFFIXES:
             wanted = f"must be a VTKHDF file, whose name ends in {' or '.join(SUFFIXES)}"
             raise InputError(f"path is {str(path)!r}, but {wanted}.")
@@ -254,20 +258,21 @@ class Trajectory:
             self.write_frames(writer)
 
     def write_frames(self, writer: vtkhdf.TrajectoryWriter) -> None:
-        """Write all frames with the ``writer`` of a file that has room for them."""
+        """Write all frames with a ``writer``."""
         for frame, step in zip(self, self.steps, strict=True):
             append_frame(writer, fields_of(frame), int(step), frame.quantities, frame.time)
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
-        """Export the fluid's surface and particles, coloured as in pictures, and the solids to other programs: see
-        `docs/into_blender.md`. Return the file to open, or the folder of a series.
+        """Export the surface of the fluid, its particles and the solids to other programs; see `docs/into_blender.md`.
+        Colours are as in pictures. Return the file to open, or the folder of a series of files.
 
-        ``to``: "usd", one file with time samples; "ply", "obj", "glb" or "vtp", files for each frame, the last with
-        ``run.pvd`` for ParaView. ``scene``: the scene or its file's path; needed for a trajectory from a file. The
-        ``folder`` must be empty or missing. In 2-D no surface is exported, and z is 0.
+        ``to`` is "usd" for one file with time samples, or "ply", "obj", "glb" or "vtp" for one file per frame. With
+        "vtp", a file ``run.pvd`` for ParaView is added. ``scene`` is the scene or the path of its file. It is needed
+        for a trajectory from a file. The ``folder`` must be empty or missing. In 2-D no surface is exported, and z is
+        0.
 
-        Raise `InputError` for another format, a folder with files, no scene or another one, a missing library, or a
-        ``picture.colour`` of the scene that was not recorded, and `ComputationError` if the disk is full.
+        Raises `InputError` for an unknown format, a folder with files, a missing or wrong scene, a missing library, or
+        a ``picture.colour`` of the scene that was not recorded. Raises `ComputationError` if the disk is full.
         """
         of = self.scene if scene is None else scene
         if of is None:
@@ -277,17 +282,20 @@ class Trajectory:
         return on_top("export")(self, folder, to, of)
 
     def to_xarray(self) -> Any:
-        """Return an ``xarray.Dataset`` with units and the dimensions time, particle, space and solid: position,
-        velocity, recorded quantities, motions of solids and, with several phases, mass_fraction. Raise `InputError` if
-        xarray is missing."""
+        """Return an ``xarray.Dataset`` with units and the dimensions time, particle, space and solid.
+
+        The data set contains position, velocity, recorded quantities, motions of solids and, with several phases,
+        mass_fraction. Raises `InputError` if xarray is missing.
+        """
         return on_top("labelled")(self)
 
     def picture(
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
-        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1; a notebook displays it. The camera
-        is placed so that the fluid is visible in every frame. Arguments ``scene``, ``device``, ``settings`` and errors
-        are as in `film`.
+        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1. A notebook displays it.
+
+        The camera is placed so that the fluid is visible in every frame. The arguments ``scene``, ``device`` and
+        ``settings``, and the errors, are as in `film`.
 
         Example: ``cortado.pictures.write_picture("last.png", trajectory.picture(width=640, height=360))``
         """
@@ -296,24 +304,26 @@ class Trajectory:
     def film(
         self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> Film:
-        """Write a film of the run and return it; a notebook plays it. A film stopped by Ctrl-C keeps its frames, and
-        the same call continues it. See `docs/pictures.md`.
+        """Write a film of the run and return it. A notebook plays the film. After a stop by Ctrl-C, a second call with
+        the same arguments continues the film. See `docs/pictures.md`.
 
         Args:
-            path: ends in .mp4, or in .webp: an animation for web pages; the call cannot continue a stopped one.
-            scene: the run's scene or its file's path; needed if the trajectory was loaded from a file.
+            path: path that ends in .mp4, or in .webp for an animation on web pages. A .webp cannot be continued after a
+                stop.
+            scene: the scene of the run or the path of its file; needed if the trajectory was loaded from a file.
             device: device that traces the rays, "cpu" or "cuda:0".
             settings: keys of the scene's table [picture], such as ``colour="speed"``, ``film_speed=0.25`` or
-                ``film_frames=100``; ``lines=1080`` sets width and height; ``camera=pictures.Orbit()`` moves the camera.
+                ``film_frames=100``; ``lines=1080`` sets width and height; ``camera=pictures.Orbit()`` moves the
+                camera.
 
         Raises:
-            SceneError: settings that do not fit.
+            SceneError: settings are invalid.
             InputError: a package is missing, or the quantity of ``colour`` was not recorded and cannot be computed.
         """
         return on_top("trajectory_film")(self, path, scene, device, settings)
 
     def _repr_html_(self) -> str:
-        """Show an animation of the run in a notebook, with its first, middle and last frame."""
+        """Show the run in a notebook, as an animation with its first, middle and last frame."""
         return on_top("trajectory_page")(self)
 
     @classmethod
@@ -339,7 +349,7 @@ class Trajectory:
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
-    """Return the diagnostic (steps,) with this name; raise `InputError` if the solver does not record it."""
+    """Return a diagnostic (steps,) by name. Raises `InputError` if the solver does not record it."""
     if name not in diagnostics:
         raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
     return diagnostics[name]

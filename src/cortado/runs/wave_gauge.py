@@ -1,14 +1,15 @@
 """The height of the fluid's surface at a place: the level up to which the fluid fills a column above a floor.
 
-The column is a grid of levels; the points x_c of a level have weights w_c that add up to 1. Solids occupy of point x_c
-the fraction
+The column is divided into levels. The points x_c of a level have weights w_c that add up to 1. At a point with the
+signed distance phi from a solid, the solid occupies the fraction
 
     s_c = min(max(1/2 - phi(x_c) / step, 0), 1)
 
-with the signed distance phi, so that a flat solid occupies exactly its height. Fractions of several solids add up, to
-at most 1. Level k has the room 1 - sum_c w_c s_c, and the fluid fills level after level. A solid that leaves no room
-above fluid, such as a boat or a ceiling, is a step in the height; a slope over the next `FILM` of depth replaces the
-step, so that slightly compressed fluid does not appear on a deck.
+where step is the distance between points. A flat solid therefore occupies exactly its height. Fractions of several
+solids add up to at most 1. Level k has the free fraction 1 - sum_c w_c s_c, and the fluid fills the levels from below.
+
+Above a solid with fluid below it, such as a boat, the height would jump as a function of the depth. The jump is
+replaced by a slope over a depth of `FILM`, so that slightly compressed fluid does not appear on a deck.
 """
 
 from dataclasses import dataclass, replace
@@ -45,42 +46,43 @@ from cortado.scene.solids import SolidTable
 
 FINE = 0.5
 ACROSS_REACH = 20.0
-"""Least number of points from the axis of a column to its side."""
+"""Least number of points between the axis and the side of a column."""
 LEAST = 1e-3
-"""Fraction of a level that must be free of solids, else the level counts as full."""
+"""Free fraction of a level that counts as full."""
 MOST = 4_000_000
 NARROW = 0.01
-"""Least fraction of a column's cross-section that must be within the container."""
+"""Least fraction of a column's cross-section inside the container."""
 FILM = 1.0
-"""Depth in spacings of the film of fluid above a solid with fluid below."""
+"""Depth of the film of fluid above a solid with fluid below it [spacings]."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """A solid near a gauge: a point r in the solid's frame is at ``middle + scale turn r``."""
+    """A solid near a wave gauge. A point r in the frame of the solid is at ``middle + scale turn r``."""
 
     own: Solid
     middle: NDArray[Any]
-    """(d,) [m]"""
     turn: NDArray[Any]
-    """(d, d)"""
+    """Rotation matrix (d, d)."""
     scale: float
     pose: Pose | None
 
     @classmethod
     def of(cls, table: SolidTable, d: int, at: Reading | None = None) -> "Standing":
-        """Place a solid at its pose in the state ``at``; a solid at rest needs no state."""
+        """Place a solid at its pose in the state ``at``. A solid at rest needs no state."""
         if at is None or not table.moves:
             return cls(table.own_solid(), table.middle(), table.turn(d), 1.0, None)
         pose = Pose.of(table.name, table.motion == "free", at)
         return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
 
     def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
-        """Return points (n, d) [m] in the solid's frame, each as its periodic image nearest to the solid's middle."""
+        """Convert points (n, d) [m] to the frame of the solid. Along periodic axes, the image nearest to the solid is
+        used."""
         return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
 
     def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
-        """Return the height above ``foot`` (d,) along ``up`` (d,) and the radius [m]; infinite if unbounded."""
+        """Return the greatest height of the solid above the point ``foot`` (d,) along ``up`` (d,) [m], and its radius
+        [m]."""
         ends = self.scale * corners(*self.own.extent())
         high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
         return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
@@ -88,21 +90,18 @@ class Standing:
 
 @dataclass(frozen=True)
 class Axis:
-    """A line upwards from a gauge's floor."""
-
     foot: tuple[float, ...]
-    """(d,) point where the axis meets the floor [m]"""
+    """Intersection of the axis and the floor (d,) [m]."""
     up: tuple[float, ...]
-    """(d,) unit vector"""
     reach: float
     step: float
-    """distance between points [m]"""
+    """Distance between points [m]."""
     film: float
     beside: tuple[tuple[float, ...], ...]
-    """(d - 1, d) unit vectors perpendicular to ``up``"""
+    """Unit vectors perpendicular to the axis (d - 1, d)."""
 
     def places(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the points (c, d) on the floor relative to the foot [m], and their weights (c,)."""
+        """Return the points (c, d) on the floor relative to ``foot`` [m], and their weights (c,)."""
         d, count = len(self.foot), int(np.ceil(self.reach / self.step))
         along = np.asarray(self.step * np.arange(-count, count + 1), dtype=np.float64)
         places = grid([along] * (d - 1))
@@ -126,17 +125,17 @@ def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tupl
 
 @dataclass(frozen=True)
 class Column:
-    """The points of a gauge's column, with the fractions that solids occupy."""
+    """The points in the column of a wave gauge, with the fractions that solids occupy."""
 
     axis: Axis
     points: NDArray[Any]
-    """(levels, c, d) [m]"""
+    """Positions of points (levels, c, d) [m]."""
     weights: NDArray[Any]
-    """(c,) weights, which add up to 1 within the container"""
+    """Weights of points (c,). The weights inside the container add up to 1."""
     outside: NDArray[Any]
-    """(c,) fraction of each point's cell outside the container"""
+    """Fraction outside the container of the cell around each point (c,)."""
     solids: list[tuple[Standing, NDArray[Any]]]
-    """solids in the column, with the distances (levels, c) of the points from each [m]"""
+    """Solids in the column, with the distances of the points from the solid (levels, c) [m]."""
 
     @classmethod
     def of(cls, axis: Axis, solids: list[Standing], domain: Domain, container: Container) -> "Column | None":
@@ -166,17 +165,17 @@ class Column:
 
     @cached_property
     def _taken(self) -> NDArray[Any]:
-        """Return the fraction (levels, c) of each point that is not free; above 1 if solids overlap."""
         return self.outside + sum(np.clip(0.5 - far / self.axis.step, 0.0, 1.0) for _, far in self.solids)
 
     @cached_property
     def room(self) -> NDArray[Any]:
-        """Return the fraction (levels,) of each level that is free."""
+        """Free fraction of each level (levels,)."""
         return np.asarray((1.0 - np.minimum(self._taken, 1.0)) @ self.weights)
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return heights, in levels, between which the height is linear in the depth, and the depths below them [m]."""
+        """The height as a piecewise linear function of the depth of the fluid: heights [levels] and depths [m] at the
+        knots."""
         filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
         kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < LEAST, False)
         kept[: int(np.argmin(blocked))] = False  # what stands on the floor
@@ -186,8 +185,11 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """Return the height [m] of fluid that would have ``depth`` [m] without solids, the fraction (levels,) of each
-        level's solids that adds to the height, and the height's derivative with respect to ``depth``."""
+        """Return the height [m] of fluid whose ``depth`` without solids is given [m], and its derivatives.
+
+        The first derivative is with respect to the volume of solids in each level (levels,). The second derivative is
+        with respect to ``depth``.
+        """
         (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
         low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
         if low == len(ends) - 1:  # above all solids
@@ -198,8 +200,8 @@ class Column:
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
     def pushes(self, depth: float, bar: float, domain: Domain) -> "list[Push]":
-        """Convert the derivative with respect to the height at a depth [m] to those with respect to motions of
-        solids."""
+        """Convert the derivative ``bar`` with respect to the height to derivatives with respect to the poses
+        of solids."""
         _, below, slope = self.level(depth)
         shares, found = bar * slope * below, list[Push]()
         for one, far in self.solids:
@@ -217,11 +219,11 @@ class Column:
 class Push:
     solid: Standing
     shift: NDArray[Any]
-    """(d,) with respect to a shift of the solid"""
+    """Derivative with respect to the position of the solid (d,)."""
     twist: NDArray[Any]
-    """(3,) with respect to a small rotation about the solid's middle"""
+    """Derivative with respect to a small rotation about the middle of the solid (3,)."""
     grown: float
-    """with respect to the scale"""
+    """Derivative with respect to the scale of the solid."""
 
     @property
     def bars(self) -> dict[str, NDArray[Any]]:
@@ -241,8 +243,8 @@ def column_of(axis: Axis, at: Reading, container: Container) -> Column | None:
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """Return the fraction (c,) of the cell around each point that is in the container; None if all cells are inside, or
-    if container sides are not parallel to the column."""
+    """Return the fraction (c,) inside the container of the cell around each point. Return None if all cells are inside,
+    or if the sides of the container are not parallel to the column."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12
@@ -264,20 +266,22 @@ def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, contain
 
 
 FINER = 4.0
-"""Factor for the number of a particle's parts along an axis if solids are in the column."""
+"""Factor for the number of parts of a particle in a column with solids."""
 
 
 @fixed
 class WaveGauge(Summed):
-    """A sensor of the height of the fluid's surface at a place: the level up to which the fluid in a column around the
-    place would fill that column from its floor. Without solids,
+    """A sensor of the height h of the fluid's surface at a place.
 
-    h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1,
+    The height is the level up to which the fluid in a column around the place would fill the column from its floor.
+    Without solids it is
 
-    where r_i is the horizontal distance and V the volume of a particle, spacing^d. Solids occupy part of the column, at
-    their pose in each step. h is the surface level also above a solid on the floor, within the fluid or piercing its
-    surface. Fluid in the air counts as if it lay on the rest, also on a solid with air below. The column ends at
-    container sides parallel to ``up``.
+    h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1.
+
+    Here r_i is the horizontal distance of particle i, V = spacing^d its volume, and w a smooth function. Solids occupy
+    part of the column. The height is also correct above a solid on the floor, within the fluid or piercing its surface.
+    Fluid in the air counts as if it lay on the fluid below, also on a solid with air below. The column ends at sides of
+    the container that are parallel to ``up``.
 
     Example::
 
@@ -294,11 +298,14 @@ class WaveGauge(Summed):
         on: str | None = None,
         axes: Axes = "world",
     ):
-        """Place a gauge at ``position`` (d,) [m]; its component along ``up`` has no effect. ``floor``: coordinate of
-        the column's bottom along ``up`` [m]. ``radius`` [m]: if left out, the larger of two support radii of the
-        smoothing kernel and five spacings. ``up`` (d,): +y if left out. ``on`` names a solid that carries the foot of
-        the column. With ``axes`` "body" the column turns with the solid, and the height is measured along the solid's
-        axes; with "world" along ``up``. Sides of the container do not bound a column on a solid."""
+        """Place a gauge at ``position`` (d,) [m]. Its component along ``up`` has no effect. ``floor`` is the coordinate
+        of the column's bottom along ``up`` [m]. ``up`` (d,) is by default the y axis. ``radius`` [m] is the radius of
+        the column. By default it is two support radii of the smoothing kernel or five spacings, whichever is larger.
+
+        ``on`` names a solid that carries the bottom of the column. With ``axes`` "body" the column rotates with the
+        solid, and the height is measured along the axes of the solid. With "world" it is measured along ``up``. Sides
+        of the container do not bound a column on a solid.
+        """
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)
         self.up = direction("up", np.eye(len(self.position))[1] if up is None else up)
@@ -309,7 +316,7 @@ class WaveGauge(Summed):
         return {"height": "m"}
 
     def summed(self, at: SensedScene) -> WeightedSum:
-        """Return the sum over horizontal distances, with more parts if the column is cut or may contain solids."""
+        """Return the sum over particles in the column."""
         axis, across, ride = self._axis(at), at.dimension - 1, ride_of(self.on, self.axes == "body", at)
         if ride is not None:
             parts = parts_of(axis.reach / FINER, at, self._across, across)
@@ -358,7 +365,7 @@ class WaveGauge(Summed):
         return _axis_of(spacing, tuple(self.position.tolist()), self.floor, tuple(self.up.tolist()), reach)
 
     def _scale(self, axis: Axis, at: SensedScene) -> float:
-        """Return the volume of a particle over the column's cross-section [m]."""
+        """Return the volume of a particle divided by the cross-section of the column [m]."""
         across, inside = at.dimension - 1, cut_by(axis, at.container) if self.on is None else None
         open_part = 1.0 if inside is None else float(axis.places()[1] @ inside)
         return float(at.lattice.cell * ACROSS[across] / axis.reach**across / open_part)

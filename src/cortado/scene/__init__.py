@@ -1,4 +1,4 @@
-"""Scenes as users write them: their tables, checked and frozen, their parameters, and their particles."""
+"""Scenes of the user: tables, parameters and particles."""
 
 from typing import TYPE_CHECKING
 

@@ -32,14 +32,14 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Liquid:
-    """Optical properties of a fluid in pictures, for the Beer-Lambert law on a path of length L."""
+    """Optical properties of a fluid in pictures. Light in fluid follows the Beer-Lambert law."""
 
     colour: Numbers
-    """Colour of scattered light, and of white light after a path of length 1 / absorption."""
+    """Colour of scattered light. White light also has this colour after the length 1 / absorption."""
     scattering: float
-    """[1/m]; the fraction exp(-scattering L) of the light is not scattered."""
+    """Scattering coefficient [1/m]. Over a length L the fraction exp(-scattering L) of the light is not scattered."""
     absorption: float
-    """[1/m]; the fraction colour^(absorption L) of the unscattered light is not absorbed."""
+    """Absorption coefficient [1/m]. Over a length L the fraction colour^(absorption L) of the light is not absorbed."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Finish:
     colour: Numbers
     transparency: float = 0.0
     reflectivity: float = 0.0
-    """Fraction of the light that the surface reflects like a mirror, tinted with its colour."""
+    """Fraction of light that the surface reflects like a coloured mirror."""
 
 
 LIQUIDS = {
@@ -64,7 +64,7 @@ FINISHES = {
 
 
 class Coloured(Table):
-    """A table with a colour, by default that of its material, or ``plain`` without a material."""
+    """A table with a colour. The default is the colour of its material, or ``plain`` without a material."""
 
     materials: ClassVar[Mapping[str, Any]]
     plain: ClassVar[Numbers]
@@ -79,24 +79,23 @@ class Coloured(Table):
 
     @field_serializer("colour", check_fields=False)
     def _given_colour(self, colour: Colour, info: SerializationInfo) -> Colour | None:
-        """Return None for a default colour, which the material implies, unless the context is "colours"."""
         return colour if "colour" in self.model_fields_set or info.context == "colours" else None
 
 
 @dataclass(frozen=True)
 class Light:
-    """Light of a picture: a lamp (the sun), a sky, and a weak strip of light opposite the sun."""
+    """Light of a picture: the sun, the sky, and a weak strip of light opposite the sun."""
 
     azimuth: float
-    """Azimuth of the sun to the right of the initial direction of the camera [degrees]."""
+    """Angle of the sun to the right of the camera's initial direction [degrees]."""
     elevation: float
-    """[degrees] above the floor"""
+    """Angle of the sun above the floor [degrees]."""
     lamp: Numbers
     strip: Numbers
     sunlight: Numbers
-    """Light from the sun on a surface that faces the sun; a white surface reflects 1."""
+    """Light of the sun on a surface that faces it."""
     shadow: float
-    """Fraction of the light on the floor that comes from the sun."""
+    """Fraction of the light on the floor from the sun."""
     background: Numbers
     zenith: Numbers
     """Colour of the sky overhead, relative to the horizon."""
@@ -149,50 +148,50 @@ LIGHTS = {
 @dataclass(frozen=True)
 class View:
     eye: Points
-    """(3,) [m]"""
+    """Position of the camera (3,) [m]."""
     look_at: Points
-    """(3,) [m]"""
+    """Point in the middle of the picture (3,) [m]."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A moment of a film, with the state of the run."""
+    """A moment of a film, with the time and the solids of the run."""
 
     share: float
-    """Fraction of the film that is over."""
+    """Elapsed fraction of the film, from 0 to 1."""
     time: float
-    """[s]"""
+    """Time of the run [s]."""
     up: Points
-    """(3,) unit vector against gravity."""
+    """Unit vector against gravity (3,)."""
     solids: Mapping[str, NDArray]
-    """(3,) current centre of each solid by name [m]."""
+    """Current centre of each solid by name (3,) [m]."""
 
 
 class CameraPath(Table):
-    """A path on which a camera moves."""
+    """A path of a moving camera."""
 
     goes_around: ClassVar[bool] = False
-    """True if the camera looks from all sides, which needs a distance that suits all of them."""
+    """True if the camera sees the scene from all sides."""
     kind: str
     """Name of the path."""
 
     def view(self, home: View, moment: Moment) -> View:
-        """Return the view at a moment; ``home`` is the view of a camera at rest."""
+        """Return the view at a moment. ``home`` is the view of a camera at rest."""
         raise NotImplementedError
 
     def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
-        """Raise a `field_error` at ``path`` if the table names a solid that is not in ``names``."""
+        """Raise a `field_error` at ``path`` if the table names an unknown solid. ``names`` are the known solids."""
 
 
 @public
 class Orbit(CameraPath):
-    """A camera path that circles the point at which the camera looks, at constant height and distance."""
+    """A circular camera path around the middle of the picture, at constant height and distance."""
 
     goes_around: ClassVar[bool] = True
     kind: Literal["orbit"] = "orbit"
     """Name of the path."""
     turns: Annotated[float, quantity(ge=-100.0, le=100.0)] = 1.0
-    """Number of turns during the film: counterclockwise seen from above, clockwise if negative."""
+    """Number of turns during the film. Seen from above, positive turns are counterclockwise."""
 
     def view(self, home: View, moment: Moment) -> View:
         from scipy.spatial.transform import Rotation
@@ -203,12 +202,12 @@ class Orbit(CameraPath):
 
 @public
 class Dolly(CameraPath):
-    """A camera path straight towards the point it looks at, or away from it, with a gentle start and end."""
+    """A straight camera path towards the middle of the picture, or away from it, with a gentle start and end."""
 
     kind: Literal["dolly"] = "dolly"
     """Name of the path."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
-    """Distance at the end, as a multiple of the distance at the start."""
+    """Distance at the end of the film, as a multiple of the distance at the start."""
 
     def view(self, home: View, moment: Moment) -> View:
         factor = self.distance ** (moment.share * moment.share * (3.0 - 2.0 * moment.share))
@@ -217,16 +216,16 @@ class Dolly(CameraPath):
 
 @public
 class Keyframes(CameraPath):
-    """A camera path along a smooth curve through given places at given times of the run."""
+    """A smooth camera path through given places at given times of the run."""
 
     kind: Literal["keyframes"] = "keyframes"
     """Name of the path."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...]
-    """(k,) Times of the run, increasing [s]; the camera rests before the first and after the last."""
+    """(k,) Increasing times of the run [s]. The camera rests before the first and after the last time."""
     cameras: tuple[tuple[Length, ...], ...]
-    """(k, 3) Positions of the camera at these times [m]."""
+    """(k, 3) Positions of the camera at the given times [m]."""
     look_at: tuple[tuple[Length, ...], ...] | None = None
-    """(k, 3) Points at which the camera looks at these times [m]; if left out, the usual point."""
+    """(k, 3) Points in the middle of the picture at the given times [m]; if left out, the point of a camera at rest."""
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -258,7 +257,7 @@ class Follow(CameraPath):
     solid: Text
     """Name of the solid."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 1.0
-    """Distance of the camera from the solid, as a multiple of its usual distance."""
+    """Distance of the camera from the solid, as a multiple of the distance of a camera at rest."""
 
     def view(self, home: View, moment: Moment) -> View:
         middle = np.asarray(moment.solids[self.solid])
@@ -278,48 +277,49 @@ Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
 class Picture(Table):
-    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Keys that are left out get
-    values that suit the scene."""
+    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Suitable values replace
+    keys that are left out."""
 
     width: Annotated[int, count(64, 7680)] = 1280
     """Columns of pixels."""
     height: Annotated[int, count(64, 4320)] = 720
     """Rows of pixels."""
     surface: Literal["liquid", "spheres"] = "liquid"
-    """"liquid": the surface of the fluid; "spheres": a sphere for each particle, in 3-D."""
+    """"liquid" draws the surface of the fluid; "spheres" draws a sphere for each particle, in 3-D."""
     quality: Literal["traced", "quick"] | None = None
-    """"traced" follows light into the fluid and out again up to three times; "quick" follows it once, on a coarser
-    surface, in about half the time, in 3-D. If left out, films of `cortado run` and `optimise` are quick, and all other
-    pictures are traced."""
+    """Quality of pictures in 3-D. "traced" follows light into the fluid and out again up to three times. "quick"
+    follows light once, on a coarser surface, and takes about half the time. If left out, films of `cortado run` and
+    `optimise` are quick, and all other pictures are traced."""
     camera: Place | None = None
     """(3,) Position of the camera [m], in 3-D; if left out, the camera sees the whole container."""
     camera_path: AnyCameraPath | None = None
-    """How the camera moves during a run, in films and in single pictures, in 3-D; if left out, it stays in place."""
+    """Path of the camera during a run, in films and in single pictures, in 3-D. If left out, the camera stays
+    in place."""
     look_at: Place | None = None
     """(3,) Point in the middle of the picture [m], in 3-D; if left out, the middle of the container."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
-    """The angle that the width of the picture spans [degrees], in 3-D."""
+    """Horizontal angle of view [degrees], in 3-D."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """Fraction of the light, from 0 to 1, that passes through fluid a tenth as thick as the container is long, in 3-D.
-    If left out, it is 0.9 with one phase, and 0 with several phases or if another colour than that of the phases is
-    shown."""
+    """Fraction of light that passes through a layer of fluid, from 0 to 1, in 3-D. The layer is a tenth as thick as the
+    container is long. If left out, it is 0.9 for a single phase in its own colour, and 0 in all other cases."""
     floor: Flag = True
     """Whether the picture shows a floor, in 3-D."""
     light: Annotated[str, OneOf(LIGHTS)] = "studio"
     """Sun and sky, in 3-D: "studio", "noon", "evening" or "overcast"."""
     background: Colour | None = None
-    """(3,) Colour behind the scene: red, green and blue, linear, each from 0 to 1; if left out, that of the light"""
+    """(3,) Colour behind the scene: red, green and blue, linear, each from 0 to 1; if left out, the colour of the
+    light."""
     colour: Annotated[str, OneOf(COLOURS)] = "phase"
-    """What colours the particles: "phase", the colours of the phases; a quantity, shown on a colour scale; or "age",
-    the time since a particle left an emitter or since the start."""
+    """Colours of particles: "phase" for the colours of the phases, or the name of a quantity on a colour scale. "age"
+    is the time since a particle left an emitter or since the start."""
     shaded: Flag = True
-    """Whether the fluid is drawn with light and shadow; if false, its colours are exactly those of the scale."""
+    """Whether the fluid is drawn with light and shadow. If false, fluid has exactly the colours of the scale."""
     film_frames: Annotated[int, count(0, 1_000_000)] | None = None
-    """Number of frames of a film, evenly chosen from the recorded states; if left out, 25 a second, and with 0 there is
-    no film. A search records as many states for its films, 121 if left out."""
+    """Number of frames of a film, evenly chosen from the recorded states. If left out, a film has 25 frames per second.
+    With 0 no film is made. A search records this number of states for its films, by default 121."""
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
-    """Seconds of the run that one second of the film shows; 1 is real time. If left out, the film runs in real time, or
-    at a speed that makes the film 4 to 10 s long."""
+    """Simulated seconds per second of the film; 1 is real time. If left out, the film runs in real time, or at a speed
+    that makes the film 4 to 10 s long."""
 
     @property
     def sun_and_sky(self) -> Light:
@@ -356,16 +356,16 @@ Pixels = Annotated[tuple[Annotated[int, count(8, 4096)], ...], components("colum
 
 
 class Render(Table):
-    """The view of a differentiable picture, and the camera of a view of the volume."""
+    """The view and the camera of a differentiable picture."""
 
     view: Literal["top", "volume", "plane"] = "top"
-    """"top": from above; "volume": through a camera; "plane": the plane itself, in 2-D, where it is the default."""
+    """"top" looks from above, "volume" looks through a camera, and "plane", the default in 2-D, shows the plane."""
     resolution: Pixels = (128, 128)
     """(2,) Columns and rows of pixels."""
     background: Colour = (1.0, 1.0, 1.0)
-    """(3,) red, green and blue, each from 0 to 1."""
+    """(3,) Background colour: red, green and blue, each from 0 to 1."""
     extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
-    """How quickly light fades in fluid [1/m]; if left out, the renderer chooses a value."""
+    """Extinction of light in fluid [1/m]; if left out, the renderer chooses a value."""
     position: Place | None = Field(default=None, validate_default=True)
     """(3,) Position of the camera [m]; required for a view of the volume."""
     look_at: Place | None = Field(default=None, validate_default=True)
@@ -373,7 +373,7 @@ class Render(Table):
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=170.0)] | None = Field(
         default=None, validate_default=True
     )
-    """Angle that the width of the picture spans [degrees], for a view of the volume; 40 if left out."""
+    """Horizontal angle of view [degrees], for a view of the volume; 40 if left out."""
 
     @field_validator("position", "look_at", "field_of_view")
     @classmethod

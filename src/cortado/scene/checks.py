@@ -1,4 +1,4 @@
-"""Checks of the names, the sizes and the fluid of a scene. Checks raise a `field_error`."""
+"""Checks of the names, sizes and fluid of a scene. A failed check raises a `field_error`."""
 
 from itertools import product
 from typing import Any
@@ -27,13 +27,13 @@ from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, check_name, field_error, field_name, usable_file
 
 DEEPEST = 0.25
-"""Largest initial overlap of free bodies with walls and each other [spacings]."""
+"""Greatest initial overlap of a free body with a solid [spacings]."""
 FINE, MOST = 0.5, 40
-"""Distance between the points at which overlaps are tested [spacings], and most points along an axis."""
+"""Distance between test points for overlaps [spacings], and greatest number of test points along an axis."""
 
 
 def check_free_bodies(scene: SceneTables) -> None:
-    """Check that free bodies start outside of walls and each other, and that the solver can move them."""
+    """Check that free bodies do not overlap walls or solids at the start, and that the solver supports free bodies."""
     bodies = free(scene.solid)
     if not bodies:
         return
@@ -76,7 +76,6 @@ def check_sheets(scene: SceneTables) -> None:
 
 
 def _check_solver(scene: SceneTables, why: str, and_why: str = "") -> None:
-    """Check that a scene with solids that only the projection handles is solved by it, with pressure."""
     if scene.solver.kind != "projection":
         raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}{and_why}')
     if not scene.forces.pressure:
@@ -84,13 +83,14 @@ def _check_solver(scene: SceneTables, why: str, and_why: str = "") -> None:
 
 
 def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
-    """Return the periodic images of points (n, d) nearest to a point (d,); periods (d,) are 0 along other axes."""
+    """Return the periodic images (n, d) that are nearest to the point ``middle`` (d,). A length of 0 means no
+    period."""
     periods = np.where(lengths > 0.0, lengths, np.inf)
     return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
 
 
 def _points_within(solid: Solid, step: float) -> Points:
-    """Return vertices of a solid's surface, and lattice points inside the solid, (n, d)."""
+    """Return the vertices of a solid and lattice points inside the solid, (n, d)."""
     sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
     points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
     return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])
@@ -100,10 +100,9 @@ NEAREST = 0.5
 """Smallest initial distance between particles [spacings]."""
 OVERLAPPING = NEAREST * (1.0 - 1e-6)
 DENSEST = 0.9
-"""Number density, relative to its value inside a fluid, above which a point is inside a body. Half a spacing outside a
-concave corner, the density is at most 7/8."""
+"""Greatest relative number density of a point outside a body of fluid."""
 SUPPORT, NEIGHBOURS = 2.0, 40
-"""Support radius for number densities [spacings], and a number greater than that of neighbours."""
+"""Support radius for number densities [spacings], and greatest number of neighbours."""
 
 
 def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
@@ -121,7 +120,8 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
 
 
 def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
-    """Check that bodies do not overlap each other or periodic images; ``lengths`` (d,) are the periods [m]."""
+    """Check that bodies of fluid do not overlap. Periodic images are included: ``lengths`` (d,) are the lengths of the
+    periodic box [m]."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
@@ -135,8 +135,6 @@ def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, s
 
 
 def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float) -> Points | None:
-    """Return a point (d,) of overlap between a body and another one shifted by ``shift`` (d,) [m]; None without
-    overlap."""
     from scipy.spatial import cKDTree
 
     one = _near(first.particles(spacing), np.array(second.extent(spacing)) + shift, spacing)
@@ -156,13 +154,11 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
 
 
 def _near(points: Points, extent: Any, spacing: float) -> Points:
-    """Return the points (n, d) inside a box and at most the support radius outside."""
     reach = SUPPORT * spacing
     return points[((points > extent[0] - reach) & (points < extent[1] + reach)).all(axis=1)]
 
 
 def _density(tree: Any, points: Points, spacing: float) -> np.ndarray:
-    """Return the number density (n,) of a tree's particles at points (n, d), relative to the density inside a fluid."""
     dimension = points.shape[1]
     distances = tree.query(points, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
     return spacing**dimension * CUBIC_SPLINE.weight(distances, dimension, SUPPORT * spacing).sum(axis=1)
@@ -175,7 +171,7 @@ def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
 
 MOST_PARTICLES = 2e8
 FURTHEST = 1e9
-"""Largest distance from the origin [spacings], where float64 still separates neighbouring particles."""
+"""Greatest allowed distance of a scene from the origin [spacings]."""
 
 
 def check_scene(scene: SceneTables) -> None:
@@ -239,7 +235,7 @@ def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
 
 
 def _check_names(scene: SceneTables) -> None:
-    """Check that names contain no "/", as they become names of arrays in files."""
+    """Check that names contain no "/"."""
     for key in ("solid", "emitter", "drain", "spring", "hinge", "sensor"):
         for index, table in enumerate(getattr(scene, key)):
             if "/" in (table.name or ""):
@@ -316,7 +312,6 @@ def _check_counts(scene: SceneTables) -> None:
 
 
 def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
-    """Check the distance of a box with corners (2, d) [m] from the origin."""
     furthest = np.abs(ends).max()
     if furthest > FURTHEST * spacing:
         wanted = f"within {FURTHEST:g} spacings of {spacing:g} m"
@@ -324,7 +319,7 @@ def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
-    """Check that a body is inside the container, first with its bounding box, as its particles may be too many."""
+    """Check that a body of fluid is inside the container."""
     spacing = scene.discretisation.spacing
     if scene.container.contains(corners(*fluid.extent(spacing)), 1e-6 * spacing).all():
         return
@@ -355,9 +350,7 @@ def _outside(index: int, place: Points) -> PydanticCustomError:
 
 
 def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) -> None:
-    """Check that an emitter's opening is inside the container, also along its path, and that fluid flows into the
-    container. The column upstream may be outside except along periodic axes. Containers are convex, so testing the
-    path's knots suffices."""
+    """Check that the opening of an emitter stays inside the container, and that its fluid flows into the container."""
     spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
     if not scene.container.contains(outlet[None], tolerance).all():

@@ -1,4 +1,4 @@
-"""Quantities over time, from constants, lists or CSV files, and checks of a solid's motion keys."""
+"""Quantities over time, from constants, lists or CSV files."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ RAMP_PARTS = 16
 @dataclass(frozen=True, eq=False)
 class Steady:
     rate: NDArray[np.float64]
-    """() or (components,), change per second"""
+    """Change per second, () or (components,)."""
 
     def at(self, times: NDArray) -> NDArray:
         """Return values (n,) or (n, components) at times (n,) [s]."""
@@ -38,26 +38,29 @@ class Steady:
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Values interpolated between times, linearly or by a cubic spline with zero slope at both ends, and constant
-    outside. A ramp multiplies the difference from ``begun`` by 10 s³ - 15 s⁴ + 6 s⁵, where s = t / ramp is at most
-    1."""
+    """Values that are interpolated between given times, linearly or by a cubic spline with zero slope at both ends. The
+    values are constant before the first and after the last time.
+
+    A ramp makes the values grow smoothly from ``begun``. The difference from ``begun`` is multiplied by 10 s³ - 15 s⁴ +
+    6 s⁵, where s = min(t / ramp, 1) and t is the time.
+    """
 
     times: NDArray[np.float64]
-    """(k,) [s]"""
+    """Times (k,) [s]."""
     values: NDArray[np.float64]
-    """(k,) or (k, components)"""
+    """Values at `times`, (k,) or (k, components)."""
     interpolation: Interpolation = "linear"
     ramp: float = 0.0
-    """Duration of the ramp, from time 0 on [s]; 0 means no ramp."""
+    """Duration of the ramp from time 0 [s]; 0 without a ramp."""
     begun: Any = 0.0
-    """Value at the start of the ramp."""
 
     def at(self, times: NDArray) -> NDArray:
         found = self._curve(times)
         return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return time derivatives, (n,) or (n, components), at times (n,) [s], just after a knot."""
+        """Return time derivatives, (n,) or (n, components), at times (n,) [s]. At a kink, return the derivative after
+        the kink."""
         found = self._slopes(times)
         if not self.ramp:
             return found
@@ -69,14 +72,13 @@ class Knots:
 
     @cached_property
     def breaks(self) -> NDArray[np.float64]:
-        """Return times (m,) [s] between which the curve is smooth: the knots, and `RAMP_PARTS` parts of a ramp."""
+        """Times (m,) [s] between which the curve is smooth."""
         along = np.linspace(0.0, self.ramp, RAMP_PARTS + 1) if self.ramp else self.times[:1]
         return np.unique(np.concatenate([self.times, along]))
 
     @property
     def seen(self) -> NDArray[np.float64]:
-        """Return values (m,) or (m, components) that cover the curve's range: the knots of a piecewise linear curve
-        without a ramp, otherwise samples."""
+        """Values of the curve, (m,) or (m, components), that cover its range."""
         straight = self.interpolation == "linear" and not self.ramp
         return self.values if straight else self.at(np.append(_within(self.breaks).ravel(), self.breaks[-1]))
 
@@ -102,14 +104,14 @@ class Knots:
         return slopes[np.searchsorted(self.times, times, side="right") - 1]
 
     def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the ramp's factor and its time derivative [1/s], each (n,) for numbers or (n, 1) for vectors."""
+        """Return the factor of the ramp and its time derivative [1/s]."""
         s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * (s * (1.0 - s)) ** 2 / self.ramp
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
-    """Return the greatest sum of rates times factors between each of the times (k,) [s] and the next; 0 for the
-    last."""
+    """Return the greatest speed within each interval between the ``times`` (k,) [s]. The speed is the sum of the rates
+    of the curves ``moved``, each multiplied by its factor."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     most = sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1)
@@ -131,24 +133,24 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
     "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
 }
-"""Factors that convert a file's unit to the scene's unit, by the scene's unit."""
+"""Factors from the units of a file to the unit of a scene."""
 MOST_BYTES = 2**25
-"""Largest size of a file [byte]."""
+"""Greatest size of a file [byte]."""
 Columns = tuple[tuple[str, str], ...]
-"""Names of columns, each with its unit in scenes."""
+"""Pairs of a column's name and its unit."""
 
 
 @cached_by_file(8, MOST_BYTES)
 def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArray, dict[str, NDArray]]:
     """Return the times (k,) [s] of a CSV file and its columns (k,) in the units of a scene.
 
-    Raises `InputError` with the file, the column, the value found and the values allowed.
+    Raises `InputError` with the file, the column, the value found and the allowed values.
 
     Args:
-        file: a header of names with units, such as ``time [s],x [mm],rotation [deg]``, then rows of numbers at
+        file: a header of names with units, such as ``time [s],x [mm],rotation [deg]``, then lines of numbers at
             increasing times.
         columns: allowed columns besides the time.
-        needs_all: True if the file must have all of these columns, False for at least one.
+        needs_all: True if the file must have all of ``columns``, False if one column is enough.
     """
     known, found = dict((("time", "s"), *columns)), dict[str, NDArray]()
     listed = ", ".join(f"{name} [{next(iter(UNITS[unit]))}]" for name, unit in known.items())
@@ -182,8 +184,8 @@ def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArra
 
 
 def lists_in_file(table: Any, path: FieldPath, columns: Columns, what: str, needs_all: bool) -> dict[str, Any]:
-    """Return the keys ``times`` and, for each column, such as ``torques``, from a table's file, in place of all others
-    that have such values; raise a `field_error`."""
+    """Return the times and columns that a table's file contains, as values of keys such as ``times`` and ``torques``.
+    Raise a `field_error` for an invalid file."""
     names = [name for name, _ in columns]
     for key in (*names, "times", *(f"{name}s" for name in names)):
         if (found := getattr(table, key)) is not None:
@@ -203,8 +205,8 @@ Rows = NDArray[np.float64]
 
 
 def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None] | None:
-    """Return the times (k,) [s] of a solid's path, with displacements (k, d) [m] and rotations (k, 1) or (k, 3) [rad]
-    since the first time; None for a solid without a path. Raises `InputError` for an unusable file."""
+    """Return the times (k,) [s] of a solid's path, its displacements (k, d) [m] and its rotations (k, 1) or (k, 3)
+    [rad]. Return None for a solid without a path. Raises `InputError` for an invalid file."""
     if solid.path is None:
         if solid.times is None:
             return None
@@ -223,7 +225,6 @@ def _since_first(rows: Any) -> Rows | None:
 
 
 def _stacked(found: Mapping[str, NDArray], names: Sequence[str], count: int) -> Rows | None:
-    """Stack the named columns to rows (count, names), with 0 for missing columns; None if all are missing."""
     if found.keys().isdisjoint(names):
         return None
     return np.stack([found.get(name, np.zeros(count)) for name in names], axis=1)
@@ -340,7 +341,8 @@ def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
 
 
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check a table's increasing ``times`` from 0 on, with as many ``values`` and no ``constant``, given by keys."""
+    """Check that the ``times`` of a table increase from 0 and that there is a value for each time. ``values`` is the
+    key of the values. The table must not also have the key ``constant``."""
     times: Sequence[float] = table.times or ()
     given = getattr(table, values)
     _check_times(path, table.times)

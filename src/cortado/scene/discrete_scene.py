@@ -1,4 +1,4 @@
-"""Discretisation of a scene: initial particles, walls, and constants of the lattice, with NumPy in float64."""
+"""Discretisation of a scene with NumPy in float64: initial fluid particles and wall particles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,27 +31,27 @@ if TYPE_CHECKING:
     from cortado.device.precision import Precision
 
 WHOLE = 1e-6
-"""Largest relative length by which a solid that fills a period may be shorter than the period."""
+"""Greatest relative gap between a solid and its periodic image that counts as closed."""
 OFF_SHEETS = 0.25
-"""Smallest initial distance of fluid from a sheet [spacings], below which particles on both sides repel each other."""
+"""Smallest initial distance of fluid from a sheet [spacings]."""
 NEAREST_PLACE = 0.4
-"""Smallest distance from surfaces of the points where weights of walls are fitted [spacings]."""
+"""Smallest distance from surfaces of the points at which weights of wall particles are fitted [spacings]."""
 
 
 @dataclass(frozen=True)
 class Walls(Rows):
     positions: Points
-    """(b, d) at the start [m]."""
+    """Initial positions (b, d) [m]."""
     weights: Points
-    """(b,) weights in the density, relative to a fluid particle [-]."""
+    """Weights of wall particles in the density, relative to a fluid particle (b,)."""
     feet: Points
-    """(b, d) vectors to the nearest point of the surface [m]."""
+    """Vectors from wall particles to their nearest points on the surface (b, d) [m]."""
     sticks: NDArray[np.bool_]
-    """(b,) True without slip."""
+    """True for no-slip walls (b,)."""
     slides: Points
-    """(b, d) velocity of the surface along the solid, in the solid's frame [m/s]."""
+    """Velocity of the sliding surface in the frame of the solid (b, d) [m/s]."""
     solid: NDArray[np.int64]
-    """(b,) number of the solid, from `wall_numbers`; -1 for the container."""
+    """Number of the solid from `wall_numbers` (b,); -1 for the container."""
 
     @classmethod
     def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
@@ -60,7 +60,7 @@ class Walls(Rows):
 
 
 def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Build the wall particles of a scene; raise `InputError` for a solid that no fluid can touch."""
+    """Build the wall particles of a scene. Raise `InputError` for a solid without contact to fluid."""
     even = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
     solids = scene.container.solids(scene.dimension, lattice.support)
     container = ContainerWalls(even, solids, scene.resting_room, lattice.spacing, lattice.support)
@@ -80,7 +80,6 @@ def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
 
 
 def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Return the container's wall particles that remain beside solids at rest."""
     from scipy.spatial import cKDTree
 
     points, dimension = container.points.some(container.stay), scene.dimension
@@ -105,7 +104,7 @@ def _even_points(container: Container, dimension: int, layers: WallLayers, spaci
 
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Build the wall particles of solids at rest, and of the container near them, where fluid can touch them."""
+    """Build the wall particles of solids at rest and of the container near these solids."""
     room, (lower, _) = container.room, scene.periods
     resting = [solid for solid in thick(scene.solid) if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
@@ -126,8 +125,7 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
 
 
 def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
-    """Build the wall particles of a moving solid alone, with periodic images if it fills a period. Other solids'
-    particles are created in the solid's frame, independent of its initial pose."""
+    """Build the wall particles of a moving solid."""
     dimension, turn = len(periods), table.turn(len(periods))
     lower, upper = table.solid().extent()
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
@@ -153,8 +151,7 @@ def _beside_sheets(
     layers: WallLayers,
     lattice: RestLattice,
 ) -> list[Walls]:
-    """Build the wall particles on both sides of sheets in a room with other walls, in the layers of a flat wall. Fluid
-    interacts only with those behind the sheet (`cortado.particles.sheets`)."""
+    """Build the wall particles on both sides of sheets."""
     if not tables:
         return []
     sheets, found, numbers = list[Sheet](), list[Walls](), wall_numbers(scene.solid)
@@ -176,8 +173,7 @@ def _beside_sheets(
 def _weighed(
     surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
 ) -> tuple[WallPoints, Points]:
-    """Return wall particles beneath a surface, with weights fitted at the points ``beside`` and at points around the
-    solids, in the presence of the walls ``kept``."""
+    """Return the wall particles below a surface and their weights."""
     room, spacing, reach = surface.container.room, lattice.spacing, lattice.support
     points = surface.walls(layers, lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
@@ -188,8 +184,8 @@ def _weighed(
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Return the coordinates of flat walls that mirror the fluid, (3,) at the lower and at the upper ends [m]; else
-    infinite."""
+    """Return the coordinates of the flat walls that mirror the fluid: lower walls (3,) and upper walls (3,) [m]. A
+    coordinate is infinite if there is no wall."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -201,21 +197,20 @@ def mirrors_of(scene: Scene) -> tuple[Points, Points]:
 @dataclass(frozen=True)
 class Lattice:
     support: float
-    """h [m]"""
+    """Support radius h of the smoothing kernel [m]."""
     normalisation: float
     """Normalisation sigma of the smoothing kernel [1 / m^d]."""
     self_weight: float
-    """W(0) [1 / m^d]."""
+    """Value W(0) of the smoothing kernel [1 / m^d]."""
     volume: float
-    """V_0 [m^d], for which kernel sums over the lattice give the rest density."""
+    """Volume of a particle for which the lattice has the rest density [m^d]."""
     cell: float
-    """Volume of a lattice cell [m^d]: a particle's mass over its rest density."""
+    """Volume of a lattice cell [m^d]."""
     stiffness: float
-    """k [m2] of delta = k / dt² [Pa m3 / kg] for a filled neighbourhood (Solenthaler and Pajarola 2009)."""
+    """Stiffness of PCISPH, without the division by the square of the time step [m2] (Solenthaler and Pajarola 2009)."""
     response: float
-    """sum_j G_j · G_j [1 / m^(2 d + 2)], for `cortado.solvers.pcisph.solver`."""
+    """Sum of squared kernel gradients over the neighbours of a particle [1 / m^(2 d + 2)]."""
     laplacian_correction: float
-    """[-]"""
     domain: Domain
 
     @classmethod
@@ -242,7 +237,7 @@ class DiscreteScene:
     wall_layers: WallLayers
     walls: Walls
     periods: Points
-    """(d,) [m]; 0 along other axes"""
+    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
 
     @cached_property
     def near(self) -> Region:
@@ -251,8 +246,10 @@ class DiscreteScene:
 
 
 def discretise(scene: Scene) -> DiscreteScene:
-    """Discretise a scene into particles. Raises `InputError` if a file with points has vanished, or if points are too
-    dense; warns if the fluid's mass differs from the prescribed mass."""
+    """Discretise a scene into particles. Warns if the mass of the fluid differs from the prescribed mass.
+
+    Raises `InputError` if a file of points no longer exists, or if its points are too close together.
+    """
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     at_rest = RestLattice(kernel, spacing, support, dimension)
@@ -284,8 +281,7 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
-    """Return initial positions (n, d) [m], with lattice particles that a sheet cuts `OFF_SHEETS` away from the
-    sheet."""
+    """Return initial positions (n, d) [m] at least `OFF_SHEETS` spacings from sheets."""
     found, least = fluid.positions.copy(), OFF_SHEETS * scene.discretisation.spacing
     for table in scene.solid:
         about = table.own_solid()
@@ -307,7 +303,7 @@ def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Point
 
 
 def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:
-    """Raise `InputError` if a scene is so far from the origin that positions would be rounded too coarsely."""
+    """Raise `InputError` if a scene is too far from the origin for the precision of positions."""
     spacing = scene.discretisation.spacing
     furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
     if furthest > precision.furthest:

@@ -1,4 +1,4 @@
-"""Drains, which take particles out of the fluid: their tables, and the parameters of sinks."""
+"""Tables of drains, which remove particles from the fluid, and parameters of sinks."""
 
 from math import inf
 from typing import Annotated, Any, Literal, Self
@@ -15,11 +15,12 @@ from cortado.scene.shape_tables import File, check_order
 from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 PRESCRIBED, BLENDED = 3.0, 3.0
-"""Thickness of the shell around a sink with prescribed flow, and of the transition outside the shell [spacings]."""
+"""Thicknesses of the two shells around a sink: the inner shell has a prescribed flow, the outer shell a transition
+[spacings]."""
 
 
 class BoxDrain(Table):
-    """A box that takes every particle which enters it."""
+    """A box that removes every particle inside."""
 
     shape: Literal["box"]
     """Kind of the drain."""
@@ -41,18 +42,18 @@ class BoxDrain(Table):
         return self
 
     def ends(self, dimension: int) -> Points:
-        """Return the corners (2, d) [m], infinite where the box has no end."""
+        """Return the lower and the upper corner (2, d) [m]. A coordinate is infinite if the box has no end there."""
         none = np.full(dimension, np.inf)
         return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
 
     def middle(self, dimension: int) -> Points:
-        """Return the middle (d,) of the box [m]; along an axis with one end, this end; without ends, 0."""
+        """Return the middle of the box (d,) [m]. Along an axis with only one end, return the coordinate of the end."""
         ends = self.ends(dimension)
         return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
 
 
 class PlaneDrain(Table):
-    """A plane that takes every particle which crosses it along `direction`; if upward, it limits the fluid level."""
+    """A plane that removes every particle which crosses it along `direction`."""
 
     shape: Literal["plane"]
     """Kind of the drain."""
@@ -76,22 +77,22 @@ class PlaneDrain(Table):
 flow_name = ending("flow_rate")
 """Parameter: flow rate of an emitter or a sink."""
 count_name = ending("count")
-"""Field: number of particles that a drain has taken."""
+"""Field: number of particles that a drain has removed."""
 
 
 class FlowTable(Table):
-    """A flow rate: one number, a table over time, or a file."""
+    """A flow rate: a constant, a table over time, or a file."""
 
     name: Text
-    """Name with which the name of the parameter begins."""
+    """Name of the emitter or sink."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)] | None = None
-    """Volume per second, in 2-D area per second [m3/s (m2/s in 2-D)]."""
+    """Volume per second [m3/s], in 2-D area per second [m2/s]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of `flow_rates`, increasing from 0 on [s]; between them flow rates are interpolated linearly."""
+    """(k,) Times of `flow_rates`, increasing from 0 [s]. Flow rates are interpolated linearly between the times."""
     flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
     """(k,) Flow rates at `times`, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
     file: File | None = None
-    """CSV file in place of `times` and `flow_rates`, with the columns `time` and `flow_rate` and units in its header. A
+    """CSV file in place of `times` and `flow_rates`. Its header has the columns `time` and `flow_rate` with units. A
     relative path starts at the scene file's folder."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -109,29 +110,30 @@ class FlowTable(Table):
 
     @property
     def course(self) -> Knots | None:
-        """Return the flow rate over time; None if constant."""
+        """Return the flow rate over time, or None if it is constant."""
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
     def begun(self) -> float:
-        """[m3/s (m2/s in 2-D)]"""
+        """Flow rate at the start [m3/s (m2/s in 2-D)]."""
         return (self.flow_rates or (self.flow_rate or 0.0,))[0]
 
     @property
     def greatest(self) -> float:
-        """[m3/s (m2/s in 2-D)]"""
+        """Greatest flow rate [m3/s (m2/s in 2-D)]."""
         return max(self.flow_rates or (self.flow_rate or 0.0,))
 
     def _at(self, times: Points) -> Points:
         return np.full(len(times), self.begun) if self.course is None else self.course.at(times)
 
     def passed(self, time: float) -> float:
-        """Return the volume, in 2-D area, that has flowed up to a time [s]."""
+        """Return the volume [m3], in 2-D the area [m2], of the fluid that has flowed until ``time`` [s]."""
         times = np.append(np.clip(self.times or 0.0, 0.0, time), time)
         return float(np.trapezoid(self._at(times), times))
 
     def time_for(self, volume: float) -> float:
-        """Return the time [s] when a volume, in 2-D area, has flowed; infinite if never."""
+        """Return the time [s] at which a volume (in 2-D an area) of fluid has flowed. Return infinity if it
+        never does."""
         last = float((self.times or (0.0,))[-1])
         times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
         flows = self._at(times)
@@ -151,7 +153,7 @@ class FlowTable(Table):
 
 
 class SinkDrain(FlowTable):
-    """A sink, towards which fluid flows from all sides with a given flow rate."""
+    """A sink. Fluid flows towards it from all sides with a given flow rate."""
 
     shape: Literal["sink"]
     """Kind of the drain."""
@@ -160,8 +162,9 @@ class SinkDrain(FlowTable):
     position: Vector[Length]
     """(d,) Centre of the sink [m], in the fluid or on a wall."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Distance from the centre at which particles are taken [m]; two and a half spacings if left out. In a shell of
-    three spacings around this sphere the sink prescribes the flow; in another three spacings the flow adapts to it."""
+    """Radius of the sphere in which particles are removed [m]; two and a half spacings if left out. The sink prescribes
+    the flow in a shell of three spacings around the sphere. In a second shell of three spacings the flow changes
+    smoothly."""
 
     def middle(self, dimension: int) -> Points:
         return np.array(self.position)
@@ -201,7 +204,6 @@ def check_drains(scene: Any) -> None:
 
 
 def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
-    """Test whether a part of a drain inside a container with corners (2, d) [m] is outside of solids at rest."""
     lower, upper = np.clip(drain.ends(scene.dimension), *ends)
     most = 512 if scene.dimension == 2 else 64
     cells = np.clip(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1, most).astype(int)
@@ -224,7 +226,7 @@ def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) 
 
 
 def sink_limit(scene: Any, values: Any) -> float:
-    """Return the longest step [s] in which fluid near sinks moves at most 0.4 spacings."""
+    """Return the longest time step [s] with sinks: fluid near a sink moves at most 0.4 spacings in a step."""
     longest, spacing = inf, scene.discretisation.spacing
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
@@ -248,12 +250,12 @@ def drain_parameters(scene: Any) -> list[Parameter]:
 
 DIRECTIONS = 1024
 PARTS = 16
-"""Number of directions around a sink, and of points along each, at which walls are searched."""
+"""Number of directions around a sink, and of sample points along a direction."""
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the open solid angle [sr], in 2-D angle [rad], without walls closer than ``radius`` [m] to a place (d,)
-    [m]."""
+    """Return the solid angle [sr] around ``place`` (d,) [m] that is free of walls within ``radius`` [m]. In 2-D, return
+    the angle [rad]."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS

@@ -1,4 +1,4 @@
-"""Emitters, columns of particles that leave at one speed: their tables and parameters."""
+"""Tables and parameters of emitters, which push columns of particles out of an opening."""
 
 import math
 from dataclasses import dataclass
@@ -21,27 +21,27 @@ from cortado.scene.tables import GREATEST, MISSING, FieldPath, Length, Text, Vec
 
 @dataclass(frozen=True)
 class EmitterSample:
-    """The m particles of an emitter, layer by layer from the outlet upstream."""
+    """The m particles of an emitter, sorted by layer. The first layer is at the opening."""
 
     offsets: Points
-    """(m, d) offsets from the axis [m]."""
+    """Vectors from the emitter's axis to the particles (m, d) [m]."""
     upstream: Points
-    """(m,) [m]"""
+    """Distances of particles upstream of the opening (m,) [m]."""
     positions: Points
-    """(m, d) [m]"""
     velocities: Points
-    """(m, d) [m/s]"""
     speed: float
-    """Speed at the start [m/s]."""
+    """Initial speed of the flow [m/s]."""
     layer: int
-    """Number of particles in a layer; m is a multiple."""
+    """Number of particles per layer."""
     column: float
-    """Length of the waiting column [m]; particles further upstream are the reserve."""
+    """Length of the column of fluid behind the opening [m]."""
 
     def in_line(self, name: str, first: int, others: Any, particles: int) -> Points:
-        """Return the distances (particles,) upstream of the opening at the start [m]: for re-emitted particles, as if
-        they had waited; for particles of others, 0. The emitter's particles begin at index ``first``, and ``others``
-        are fields of a state."""
+        """Return the initial distances upstream of the opening (particles,) [m]; 0 for particles that the emitter does
+        not emit.
+
+        ``first`` is the index of the emitter's first particle. ``others`` are fields of a state.
+        """
         found = np.zeros(particles)
         found[first : first + len(self.upstream)] = self.upstream
         if (again := others.get(again_name(name))) is None:
@@ -50,15 +50,15 @@ class EmitterSample:
         return np.where(np.ravel(again) > 0.0, joined, found)
 
     def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
-        """Return a mask (particles,) of the particles that wait in the emitter; ``others`` are fields of a state."""
+        """Return True for each particle that has not left the emitter yet (particles,). ``others`` are fields of a
+        state."""
         emitted = float(np.ravel(others[emitted_name(name)])[0])
         return self.in_line(name, first, others, particles) > emitted
 
 
 OF_OPENINGS = ("emitted", "again", "drained", ".count")
-"""Suffixes of state fields about emitters and drains."""
 COLUMN = 6.0
-"""Default length of the column [spacings], which gives fluid at the opening a full neighbourhood."""
+"""Default length of the column of fluid behind the opening [spacings]."""
 
 
 path_name = ending("path")
@@ -68,7 +68,7 @@ outlet_name = ending("outlet")
 emitted_name = ending("emitted")
 """Field: length of the column that has left an emitter [m]."""
 again_name = ending("again")
-"""Field: number of each re-emitted particle in the emitter's line, from 1 on; 0 for other particles."""
+"""Field: place of each re-emitted particle in the queue of the emitter, from 1; 0 for particles outside the queue."""
 
 
 def _path_of(name: str, of: str, outlet: Any, course: Knots | None = None) -> Parameter:
@@ -80,28 +80,28 @@ OutletPath: Any = course_table(_path_of("emitter_path", "an emitter", (0.0, 0.0)
 
 
 class EmitterTable(FluidBody, FlowTable):
-    """An opening, round or rectangular, in 2-D a line, from which a column of fluid leaves at one speed."""
+    """An emitter with a round or rectangular opening, in 2-D a line. Fluid leaves the opening at one speed."""
 
     name: Text = "nozzle"
-    """Name of the emitter; the names of its parameters begin with it."""
+    """Name of the emitter. The names of the emitter's parameters begin with it."""
     outlet: Vector[Length]
     """(d,) Middle of the opening [m]."""
     direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length has no effect."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Radius of a round opening, in 2-D half its width [m]. Fluid passes through the lattice cells inside the opening.
-    The speed of the flow, which `describe` prints, is the flow rate divided by the area of these cells."""
+    """Radius of a round opening, in 2-D half its width [m]. Fluid passes through the lattice cells inside the opening,
+    so the speed is the flow rate divided by the area of these cells. `describe` prints the speed."""
     sides: tuple[Annotated[float, quantity("m", gt=0.0)], ...] | None = None
-    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]. In 3-D the widths are along the two axes, in
-    order, that are most nearly perpendicular to the direction."""
+    """(d - 1,) Widths of a rectangular opening, in place of `radius` [m]. In 3-D the widths are along the two axes of
+    space that are most nearly perpendicular to `direction`."""
     length: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Length of the column that waits upstream of the opening [m]; six spacings if left out."""
+    """Length of the column of fluid that waits behind the opening [m]; six spacings if left out."""
     volume: Annotated[float, quantity("m3 (m2 in 2-D)", gt=0.0)] | None = None
-    """Volume, in 2-D area, that the emitter emits in total [m3 (m2 in 2-D)]. If left out, commands such as `cortado
-    run` provide enough for the run, and `Simulation` provides only the column (`Scene.lasting`)."""
+    """Total volume that the emitter emits [m3], in 2-D area [m2]. If left out, commands such as ``cortado run`` provide
+    enough fluid for the run, but `Simulation` provides only the waiting column (see `Scene.lasting`)."""
     fed_by: tuple[Text, ...] = ()
-    """Names of drains whose particles this emitter emits again. The emitter then has no other particles than the
-    column, and a `volume` if given. A drain can feed only one emitter."""
+    """Names of drains. The emitter emits the particles that these drains remove. It then has no other fluid than the
+    waiting column and `volume`. A drain can feed only one emitter."""
     path: OutletPath | None = None
     """Middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
@@ -112,7 +112,6 @@ class EmitterTable(FluidBody, FlowTable):
     @field_validator("direction")
     @classmethod
     def _normalise(cls, direction: tuple[float, ...]) -> tuple[float, ...]:
-        """Normalise a direction that is not normalised to round-off, so that JSON gives the same scene."""
         size = math.hypot(*direction)
         if size < 1.0 / GREATEST:
             raise field_error((), direction, "a vector that is not zero")
@@ -132,7 +131,7 @@ class EmitterTable(FluidBody, FlowTable):
         return placed.model_copy(update={"path": self.path.in_dimension(dimension, (*path, "path"))})
 
     def layers(self, spacing: float) -> float:
-        """Return the number of layers in the column, which may exceed the largest array."""
+        """Return the number of layers of particles in the waiting column."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
         return within if self.volume is None or self.fed_by else min(within, self.supply(spacing))
@@ -144,27 +143,26 @@ class EmitterTable(FluidBody, FlowTable):
         return float(max(math.ceil(given - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """Return the time [s] when the emitter runs out of fluid; infinite if never."""
+        """Return the time [s] at which the emitter runs out of fluid; infinite if never."""
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return the table with a volume that lasts until a time [s]; unchanged with a volume or a long enough
-        column."""
+        """Return the table with enough fluid until ``time`` [s]. A table with a volume is returned unchanged."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)
         return self.model_copy(update={"volume": self.passed(time) + column})
 
     def speed(self, spacing: float) -> float:
-        """Return the greatest speed of the flow [m/s]: the flow rate over the area of a layer's cells."""
+        """Return the greatest speed of the flow [m/s]."""
         return self.greatest / self.area(spacing)
 
     def area(self, spacing: float) -> float:
-        """Return the area of a layer's lattice cells across the flow [m2], in 2-D their width [m]."""
+        """Return the area of the lattice cells inside the opening [m2], in 2-D their width [m]."""
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """Return the area of the opening from the keys [m2], in 2-D its width [m]."""
+        """Area of the opening [m2], in 2-D its width [m]."""
         if self.radius is None:
             return math.prod(self.sides or ())
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
@@ -174,7 +172,7 @@ class EmitterTable(FluidBody, FlowTable):
         return max(self.sides or (2.0 * (self.radius or 0.0),))
 
     def opening(self, spacing: float) -> Points:
-        """Return positions (n, d) of a layer of particles in the opening [m]."""
+        """Return the positions (n, d) [m] of a layer of particles in the opening."""
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:
@@ -208,12 +206,11 @@ class EmitterTable(FluidBody, FlowTable):
         return sample.positions[sample.upstream < sample.column]
 
     def _cells(self, spacing: float) -> Points:
-        """Return the numbers of cells (d - 1,) across the opening, as floats, at least one each."""
+        """Return the numbers of lattice cells across the opening (d - 1,)."""
         sides = self.sides or (2.0 * (self.radius or 0.0),) * (len(self.outlet) - 1)
         return np.maximum(whole_cells(np.array(sides), spacing), 1.0)
 
     def _cross_section(self, spacing: float) -> Points:
-        """Return offsets (n, d) of a layer's particles from the axis [m]."""
         size = len(self.outlet) - 1
         points = lattice(self._cells(spacing), spacing) if self.radius is None else disc(self.radius, spacing, size)
         return points @ across(self.direction)
@@ -241,7 +238,7 @@ def check_fed(scene: Any) -> None:
 
 
 def check_columns(scene: Any) -> None:
-    """Check that no sheet crosses an emitter's column or is closer than a spacing to its opening at the start."""
+    """Check that at the start no sheet crosses the waiting column of an emitter or is close to the opening."""
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         opening, ahead = emitter.opening(spacing), spacing * np.array(emitter.direction)
@@ -255,7 +252,8 @@ def check_columns(scene: Any) -> None:
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
-    """Return for each emitter its name, the index of its first of ``count`` particles, and its particles."""
+    """Return the name of each emitter, the index of its first particle, and its particles. ``count`` is the number of
+    fluid particles in the scene."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
     names = [emitter.name for emitter in scene.emitter]
@@ -263,7 +261,8 @@ def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
 
 
 def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:
-    """Return a mask (particles,) of the particles that wait in emitters; ``others`` are fields of a state."""
+    """Return True for each particle that has not left its emitter yet (particles,). ``others`` are fields of a
+    state."""
     found = np.zeros(particles, dtype=bool)
     for name, first, sample in samples(scene, particles):
         if emitted_name(name) in others:

@@ -1,5 +1,8 @@
-"""Fluid particles of a scene, in float64. A body whose surface cuts lattice cells starts with as many particles as fit
-its volume, which are then packed (`cortado.discretise.packing`)."""
+"""Fluid particles of a scene, in float64.
+
+A body of fluid with a curved or oblique surface starts with the number of particles that fits its volume. These
+particles are then packed (`cortado.discretise.packing`).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,21 +20,20 @@ from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 
 FINER = 4
-"""Parts along each axis into which cells at a surface are divided to measure a volume."""
+"""Number of parts along each axis into which a lattice cell is divided to measure a volume."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
-"""Largest fractions of missing particles in a packed body: of particles in the outermost spacing near cut cells, and of
-all. Off the lattice, the density is up to 4 % higher than on the lattice."""
+"""Greatest fraction of missing particles near the surface of a packed body, and in the whole body."""
 BESIDE = 2
-"""Largest distance along each axis from a cut cell at which particles may be left out [cells]."""
+"""Greatest distance between an omitted particle and the surface, along each axis [cells]."""
 FAR = 4.0
-"""Depth in a body up to which depths are computed [spacings]."""
+"""Greatest depth below the surface that is computed [spacings]."""
 DIGITS = 6
-"""Decimals of depths [spacings] by which particles are sorted, so that round-off does not change the order."""
+"""Number of decimals of depths [spacings] when particles are sorted by depth."""
 
 
 def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """Test whether a body's particles may be off the lattice: its surface cuts cells, or a solid is within ``reach``
-    [m]."""
+    """Test if the particles of a body are packed. This is so if its surface cuts lattice cells, or if a solid is within
+    ``reach`` [m]."""
     if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
         return isinstance(fluid, RegionFluid)
     return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
@@ -42,20 +44,19 @@ class CutBody:
     fluid: RegionFluid
     room: Room
     spacing: float
-    """[m]"""
 
     def distance(self, points: Points, reach: float) -> Points:
-        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside, as in
-        `Room.from_solids`."""
+        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
-        """Return the fraction (n,) of the cell around each point (n, d) [m] inside the body."""
+        """Return the fraction of each lattice cell that is inside the body (n,). ``points`` (n, d) are the cells'
+        centres [m]."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
-        """Return the volume [m^d] deeper than ``depth`` [m] below the surface, in all cells or only beside cut
-        cells."""
+        """Return the volume more than ``depth`` [m] below the surface [m^d]. ``beside_cuts`` restricts it to cells near
+        cells that the surface cuts."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
         cells = cells[self._beside_cuts(cells)] if beside_cuts else cells
@@ -69,7 +70,7 @@ class CutBody:
 
     @cached_property
     def asked(self) -> float:
-        """Return the prescribed volume [m^d]: the shape's exact volume times the fraction outside of walls."""
+        """Prescribed volume of the body outside walls [m^d]."""
         everywhere = Room(Region.everywhere(self.room.dimension), (), self.room.periods)
         return self.fluid.volume(self.spacing) * self._held / replace(self, room=everywhere)._held
 
@@ -84,7 +85,7 @@ class CutBody:
         return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
-        """Return initial positions (n, d) [m]: lattice points, near cells that surfaces cut only the deepest ones."""
+        """Return initial positions on the lattice (n, d) [m]."""
         if not self._cuts_cells():
             return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
@@ -93,7 +94,6 @@ class CutBody:
         return points[np.sort(np.argsort(depths, kind="stable")[: self.count])]
 
     def _beside_cuts(self, points: Points) -> Which:
-        """Test (n,) which points (n, d) [m] are within `BESIDE` cells of a cell that a surface cuts."""
         reach = (BESIDE + 0.5) * self.fluid.block(self.spacing).spacings.max()
         return np.asarray(self._cut.query(points, p=np.inf, distance_upper_bound=reach)[0] < reach)
 
@@ -116,21 +116,21 @@ class CutBody:
 class Surroundings:
     bodies: tuple[CutBody, ...]
     staying: Points
-    """(m, d) particles of other fluid [m]."""
+    """Positions of the particles that packing does not move (m, d) [m]."""
     lower: Points
-    """(d,) [m]"""
+    """Lower corner of the periodic box (d,) [m]."""
     lengths: Points
-    """(d,) [m]; 0 without period"""
+    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
 
     def air(self, reach: float) -> tuple[Points, Points]:
-        """Return lattice points (m, d) [m] around the bodies, up to ``reach`` [m] from their surfaces, and the fraction
-        (m,) of the cell around each that is neither fluid nor wall."""
+        """Return lattice points in the air, within ``reach`` [m] of the surfaces of bodies (m, d) [m]. Also return the
+        fraction of air in the lattice cell around each point (m,)."""
         found = [self._air_around(body, reach) for body in self.bodies]
         points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return points[shares > 0.0], shares[shares > 0.0]
 
     def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """Return the air of one body: points nearer to this body than to others, within half a period of it."""
+        """Return the air around one body of fluid."""
         points = body.fluid.lattice(body.spacing, reach + body.spacing)
         middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
         within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
@@ -157,27 +157,28 @@ class Surroundings:
 @dataclass(frozen=True)
 class FluidSample:
     positions: Points
-    """(n, d) [m]"""
+    """Positions (n, d) [m]."""
     velocities: Points
-    """(n, d) [m/s]"""
+    """Velocities (n, d) [m/s]."""
     phase: NDArray[np.int64]
-    """(n,) index"""
+    """Index of the phase of each particle (n,)."""
     sizes: tuple[int, ...]
     """Number of particles of each body of fluid, without emitters."""
     asked: tuple[float, ...]
-    """Prescribed volume [m^d] of each body outside of walls; for points, the volume of the particles."""
+    """Prescribed volume of each body outside walls [m^d]."""
     bodies: tuple[CutBody, ...]
     is_packed: NDArray[np.bool_]
-    """(n,) True for particles of `bodies`."""
+    """True for packed particles (n,)."""
     is_placed: NDArray[np.bool_]
-    """(n,) True for a particle with a prescribed position: a point of a file, or a particle in an emitter."""
+    """True for particles of a file of points or of an emitter (n,)."""
     emitters: tuple[tuple[str, int, EmitterSample], ...]
-    """For each emitter, its name, the index of its first particle, and its particles."""
+    """Name of each emitter, index of its first particle, and its particles."""
     places: Points
-    """(n, d) positions of particles in reserve or taken by drains [m]."""
+    """Resting positions of particles outside the simulation (n, d) [m]."""
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """Return the sample of the particles with sorted indices (m,), which must include all particles of emitters."""
+        """Return the sample of the particles with sorted indices ``kept`` (m,). No particle of an emitter may be
+        missing."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -187,7 +188,7 @@ class FluidSample:
 
     @property
     def names(self) -> NDArray[np.str_]:
-        """Return the name (n,) of each particle's body, such as "fluid[1]"."""
+        """Return the name of the body of each particle (n,), such as "fluid[1]"."""
         named = *(f"fluid[{k}]" for k in range(len(self.sizes))), *(f"emitter {name}" for name, _, _ in self.emitters)
         ends = *np.cumsum(self.sizes), *(first for _, first, _ in self.emitters[1:]), len(self.positions)
         return np.repeat(named, np.diff(ends[: len(named)], prepend=0))
@@ -199,8 +200,8 @@ class FluidSample:
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """Build the fluid of a scene before packing. Raises `InputError` if a file with points has vanished, or if walls
-    leave no room for any particle of a fluid."""
+    """Build the fluid particles of a scene before packing. Raises `InputError` if a file of points no longer exists, or
+    if walls leave no room for a body of fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = scene.room, scene.discretisation.support_radius
     bodies, positions, velocities, asked = list[CutBody | None](), list[Points](), list[Points](), list[float]()
@@ -238,8 +239,11 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def resting_places(scene: Scene, count: int) -> Points:
-    """Return positions (count, d) [m] for particles in reserve or taken by drains, outside of everything and without
-    neighbours. Along periodic axes only as many as fit; NaN if all axes are periodic."""
+    """Return positions (count, d) [m] for particles outside the simulation: reserves of emitters, and particles that
+    drains removed.
+
+    The positions are far from the scene and from each other. They are NaN if all axes are periodic.
+    """
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     boxes = [body.extent(spacing) for body in (*scene.fluid, *scene.emitter)]
     boxes += [solid.body().extent() for solid in scene.solid]
@@ -267,12 +271,12 @@ def _why_none(body: CutBody | None, spacing: float) -> str:
 
 @dataclass(frozen=True)
 class FluidMasses:
-    """Masses of fluid by phase [kg]; in 2-D per metre of depth."""
+    """Masses of fluid by phase [kg], in 2-D per metre of depth."""
 
     given: Mapping[str, float]
-    """Mass of the particles at the start, including particles that wait in emitters."""
+    """Initial mass of the particles, with the particles in emitters."""
     asked: Mapping[str, float]
-    """Prescribed mass: of the bodies' volumes outside of walls, plus the emitters' fluid."""
+    """Prescribed mass of the bodies of fluid and of the fluid in emitters."""
 
     @classmethod
     def of(cls, scene: Scene, fluid: FluidSample) -> Self:
@@ -287,7 +291,8 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return, by phase, words about each mass that differs from the prescribed mass by more than `EXCESS`."""
+        """Return a message for each phase with a wrong mass, by the phase's name. A mass is wrong if it differs from
+        the prescribed mass by more than `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()

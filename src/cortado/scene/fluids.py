@@ -1,4 +1,4 @@
-"""Shapes of bodies of fluid, with their particles."""
+"""Bodies of fluid with various shapes, and their particles."""
 
 from abc import abstractmethod
 from dataclasses import replace
@@ -16,26 +16,26 @@ from cortado.scene.shape_tables import BoxShape, CylinderShape, File, MeshShape,
 from cortado.scene.tables import FieldPath, Length, Rotation, Table, Text, Turning, Vector, quantity, rotation_matrix
 
 ALIGNED = 1e-3
-"""Largest distance of a surface from faces of lattice cells [spacings] for which the surface cuts no cell."""
+"""Tolerance for a surface along faces of lattice cells [spacings]."""
 
 
 class FluidBody(Table):
-    """Particles of one phase: a body of fluid, or the contents of an emitter."""
+    """Particles of one phase, in a body of fluid or in an emitter."""
 
     phase: Text
-    """Name of its phase."""
+    """Name of the phase."""
 
     @abstractmethod
     def count(self, spacing: float) -> float:
-        """Return an upper bound of the number of particles, without creating them."""
+        """Return an upper bound on the number of particles, without creating them."""
 
     @abstractmethod
     def extent(self, spacing: float) -> tuple[Points, Points]:
-        """Return a box around all particles: lower and upper corner, each (d,) [m]."""
+        """Return the lower and upper corner of a box around all particles, (d,) each [m]."""
 
     @abstractmethod
     def particles(self, spacing: float) -> Points:
-        """(n, d) [m]"""
+        """Return the positions of the particles (n, d) [m]."""
 
 
 class Fluid(FluidBody):
@@ -44,16 +44,15 @@ class Fluid(FluidBody):
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) Velocity at the start [m/s]."""
     angular_velocity: Turning | None = None
-    """Angular velocity about its middle at the start [rad/s]; no spin if left out. In 3-D a vector, in 2-D one number,
-    counterclockwise."""
+    """Initial angular velocity about the middle of the body [rad/s]; no rotation if left out. In 3-D a vector, in 2-D
+    one number, counterclockwise."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self._check_turns(("angular_velocity",), dimension, path)
         return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
-        """Return initial velocities (n, d) [m/s] for all particles' positions (n, d) [m], with spin about their
-        mean."""
+        """Return initial velocities (n, d) [m/s] of particles at positions (n, d) [m]."""
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
         if self.angular_velocity is None:
             return found
@@ -68,27 +67,28 @@ class Fluid(FluidBody):
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
 
     def witnesses(self, spacing: float) -> Points:
-        """Return points (n, d) [m] such that a convex region with these points contains all particles."""
+        """Return points (n, d) [m] with a convex hull that contains all particles."""
         return self.particles(spacing)
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the particles (n, d) [m] that walls do not displace."""
+        """Return the positions of the particles in ``room`` (n, d) [m]."""
         return self.particles(spacing)
 
     @abstractmethod
     def volume(self, spacing: float) -> float:
-        """Return the volume [m^d] of the uncut shape; for points, the volume of the particles."""
+        """Return the volume of the body [m^d]."""
 
 
 class RegionFluid(Fluid):
-    """Fluid that fills a shape, with particles on a lattice or packed."""
+    """Fluid that fills a shape."""
 
     @abstractmethod
     def block(self, spacing: float) -> Block: ...
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the unrotated shape with its centroid at the origin, and the centroid (d,) that its keys imply [m]."""
+        """Return the shape with its centroid at the origin, without a rotation. Also return the centroid's position
+        (d,) [m]."""
 
     def volume(self, spacing: float) -> float:
         return self.shape_about()[0].moments().volume
@@ -103,31 +103,30 @@ class RegionFluid(Fluid):
         return self.block(spacing).points()
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the particles (n, d) [m] at least half a spacing from all walls."""
+        """Return the positions of the particles in ``room`` (n, d) [m]. They are at least half a spacing from walls."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
     @abstractmethod
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        """Return distances (n,) [m] of points (n, d) [m] from the fluid, negative inside. Beyond ``reach`` [m] only
-        their signs and lower bounds are exact."""
+        """Return signed distances (n,) [m] of points (n, d) [m] from the fluid, negative inside. Distances greater than
+        ``reach`` [m] are only lower bounds."""
 
     def cuts_cells(self, spacing: float) -> bool:
-        """Return True if the surface cuts cells of the lattice."""
+        """Test if the surface cuts cells of the lattice."""
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return lattice points (n, d) [m] in the box around the shape, extended by ``reach`` [m]; cells fit between
-        flat faces."""
+        """Return lattice points (n, d) [m] in the box around the shape. ``reach`` [m] extends the box."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
 class Turnable(RegionFluid):
-    """A body that may be rotated; its particles are then packed."""
+    """A body of fluid that may be rotated. The particles of a rotated body are packed."""
 
     rotation: Rotation | None = None
-    """Rotation about its middle [rad]; not rotated if left out. In 3-D a rotation vector, in 2-D one number,
-    counterclockwise."""
+    """Rotation about the middle of the body [rad]; no rotation if left out. In 3-D a rotation vector, in 2-D one
+    number, counterclockwise."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self._check_turns(("rotation",), dimension, path)
@@ -135,10 +134,12 @@ class Turnable(RegionFluid):
 
 
 class BoxFluid(BoxShape, Turnable):
-    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or packed if rotated. If a side is no integer
-    multiple of the spacing, particles are up to 3 % further apart along some axes and closer along others, and the mass
-    is right within 0.3 %. If no lattice fits that well, the particles are packed, and the mass is up to 0.8 % too
-    small; `describe` and a run then print both masses."""
+    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or with packed particles if rotated.
+
+    If a side is no multiple of the spacing, the lattice is stretched or compressed by up to 3 %. The mass is then right
+    within 0.3 %. If no lattice fits so well, the particles are packed, and the mass is up to 0.8 % too small.
+    `describe` and a run then print the prescribed and the actual mass.
+    """
 
     def block(self, spacing: float) -> Block:
         return block_filling(self.lower, self.upper, spacing)
@@ -159,8 +160,7 @@ class BoxFluid(BoxShape, Turnable):
 
 
 class RoundFluid(RegionFluid):
-    """A body of fluid whose surface cuts cells of the lattice. The particles are packed before a run, and ``particles``
-    returns the cells from which packing starts."""
+    """A body of fluid with a curved surface. Its particles are packed before a run."""
 
     def particles(self, spacing: float) -> Points:
         points = self.block(spacing).points()
@@ -201,7 +201,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return a lattice stretched along the axis so that layers fill the height, and narrowed across."""
+        """Return a lattice with layers that fill the height of the cylinder."""
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
@@ -213,15 +213,15 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
 
 
 class PointsFluid(Fluid):
-    """Fluid particles at the positions that a file contains."""
+    """Fluid particles at the positions in a file."""
 
     shape: Literal["points"] = "points"
     file: File
-    """An array (n, d) [m] as .npy, or a .vtk, .vtp or .vtkhdf file, of which only the first time step is read. A
-    relative path starts at the scene file's folder."""
+    """A file of positions (n, d) [m]: .npy, .vtk, .vtp or .vtkhdf. Only the first time step is read. A relative path
+    starts at the scene file's folder."""
 
     def points(self) -> Points:
-        """Read the positions (n, d) [m] from the file; raise `InputError`."""
+        """Read the positions (n, d) [m] from the file. Raise `InputError` for an invalid file."""
         return read_points(self.file, len(self.velocity))
 
     def count(self, spacing: float) -> float:
@@ -238,8 +238,8 @@ class PointsFluid(Fluid):
 
 
 class Filled(Turnable):
-    """A body of fluid that fills a solid shape. The particles are packed, unless the surface follows cells of the
-    lattice that starts at the lower corner of the body's box."""
+    """A body of fluid that fills a solid shape with packed particles, or with a lattice if the shape is aligned with
+    it."""
 
     def body(self) -> Placed:
         shape, middle = self.shape_about()
@@ -269,7 +269,7 @@ class FilledShape(Filled):
     """A body of fluid with a shape and an optional position."""
 
     position: tuple[Length, ...] | None = None
-    """(d,) Position of the centroid of its volume [m]; if left out, the other keys of the shape determine it."""
+    """(d,) Position of the centroid [m]; if left out, the shape's corners or mesh determine it."""
 
     def body(self) -> Placed:
         placed = super().body()
@@ -293,7 +293,7 @@ class TurnedCylinder(Filled, CylinderFluid):
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """Return a rotated box or cylinder as a packed body, and any other body of fluid unchanged."""
+    """Return a rotated box or cylinder as a packed body. Return any other body of fluid unchanged."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:

@@ -1,4 +1,4 @@
-"""Degrees of freedom of free bodies, hinges and springs between bodies, with their tables, parameters and time step."""
+"""Hinges and springs of free bodies: tables, parameters, degrees of freedom and time step limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,44 +26,44 @@ COLUMNS = (("torque", "N m"), ("speed", "rad/s"))
 
 
 class HingeTable(Table):
-    """A hinge about which a free body turns. At the hinge, one point of the body stays fixed in space, or stays on a
-    point of another solid."""
+    """A hinge of a free body. The hinge keeps one point of the body fixed in space, or fixed to a point of a second
+    solid."""
 
     name: Text
     """Name of the hinge."""
     solid: Text
     """Name of the free body."""
     to: Text | None = None
-    """Name of a moving solid to which the hinge joins the body; if left out, the hinge is fixed in space."""
+    """Name of the moving solid to which the body is joined; if left out, the hinge is fixed in space."""
     position: Vector[Length]
     """(d,) Position of the hinge at the start [m]."""
     axis: tuple[Annotated[float, quantity()], ...] | None = None
-    """(3,) Direction of the hinge's axis at the start, in 3-D only; its length has no effect. If left out, the body can
-    turn about every axis through the hinge."""
+    """(3,) Initial direction of the hinge's axis, in 3-D only; its length has no effect. If left out, the hinge is a
+    ball joint: the body can turn about every axis."""
     stiffness: Annotated[float, quantity("N m/rad", ge=0.0)] | None = None
-    """Torque per radian of turn away from `rest_angle` [N m/rad]; in 2-D per metre of depth."""
+    """Torque of the spring per radian of turn away from `rest_angle` [N m/rad]; in 2-D per metre of depth."""
     rest_angle: Annotated[float, quantity("rad", ge=-3.0, le=3.0)] = 0.0
-    """Turn since the start at which the torque of the stiffness is 0 [rad]."""
+    """Turn since the start at which the spring has no torque [rad]."""
     damping: Annotated[float, quantity("N m s/rad", ge=0.0)] | None = None
-    """Damping torque per angular velocity relative to `speed` [N m s/rad]."""
+    """Damping coefficient [N m s/rad]: torque per difference between the angular velocity and `speed`."""
     torque: Annotated[float, quantity("N m")] | None = None
-    """Constant torque of a motor on the body [N m]."""
+    """Constant torque of the motor on the body [N m]."""
     speed: Annotated[float, quantity("rad/s")] | None = None
-    """Angular velocity towards which the damping drives the body, as a motor does [rad/s]."""
+    """Target angular velocity of the motor [rad/s]. The damping drives the body towards this angular velocity."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of `torques` or `speeds`, increasing from 0 on [s]; between times the motor's values are interpolated
-    linearly."""
+    """(k,) Times of `torques` or `speeds`, increasing from 0 [s]. Values are interpolated linearly between the
+    times."""
     torques: tuple[Annotated[float, quantity("N m")], ...] | None = None
-    """(k,) Torques of a motor at `times`, in place of `torque` [N m]."""
+    """(k,) Torques of the motor at `times`, in place of `torque` [N m]."""
     speeds: tuple[Annotated[float, quantity("rad/s")], ...] | None = None
-    """(k,) Angular velocities of a motor at `times`, in place of `speed` [rad/s]."""
+    """(k,) Target angular velocities of the motor at `times`, in place of `speed` [rad/s]."""
     file: File | None = None
-    """CSV file in place of `times`, `torques` and `speeds`, with a column `time` and one or both of `torque` and
-    `speed`, each with its unit in the header. A relative path starts at the scene file's folder."""
+    """CSV file in place of `times`, `torques` and `speeds`. It has a column `time`, and a column `torque` or `speed` or
+    both, with units in the header. A relative path starts at the scene file's folder."""
 
     @property
     def turned_by(self) -> str | None:
-        """Return the first key of a spring, a damper or a motor that turns the body about the hinge, if any."""
+        """Return the first key of a spring, damper or motor of the hinge, or None."""
         keys = ("stiffness", "damping", "torque", "speed", "times")
         return next((key for key in keys if getattr(self, key) is not None), None)
 
@@ -88,27 +88,27 @@ class HingeTable(Table):
         return super().in_dimension(dimension, path)
 
     def course(self, name: str) -> Knots | None:
-        """Return the motor's torque or speed over time; None if constant."""
+        """Return the motor's torque or speed over time, or None if it is constant."""
         values = getattr(self, f"{name}s")
         return None if values is None else Knots(np.array(self.times), np.array(values))
 
 
 @dataclass(frozen=True)
 class Hold:
-    """Degrees of freedom of a free body, for `cortado.sph.moving_solids`."""
+    """Degrees of freedom of a free body."""
 
     moving: Three = (1.0, 1.0, 1.0)
-    """For each axis of space, 1 if the body's centre may move along the axis, else 0."""
+    """For each axis of space, 1 if the body's centre of mass may move along the axis, else 0."""
     turning: int = 3
-    """Number of axes of space about which the body may turn; 3 for a turning body in 2-D."""
+    """Number of axes about which the body may turn; 3 for a turning body in 2-D."""
     axis: Three = (0.0, 0.0, 0.0)
-    """Unit vector: the axis of rotation if `turning` is 1, the blocked axis if `turning` is 2."""
+    """Unit vector: the axis of rotation if `turning` is 1, or the blocked axis if `turning` is 2."""
     arm: Three = (0.0, 0.0, 0.0)
     """Vector from the centre of mass to the hinge in the body's frame [m]; 0 without a hinge."""
 
     @classmethod
     def of(cls, table: SolidTable, dimension: int, hinges: Sequence[HingeTable] = ()) -> Self:
-        """Return the degrees of freedom of a free body, from its hinge to space or else from its key `freedom`."""
+        """Return the degrees of freedom of a free body, from its hinge or from its key `freedom`."""
         for hinge in hinges:
             if hinge.solid == table.name and hinge.to is None:
                 arm = in_frame(table, hinge.position)
@@ -129,14 +129,14 @@ def _three(vector: Any) -> Three:
 
 
 def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
-    """Return the inertia (3, 3) about the hinge, or about the centre of mass without a hinge, in the body's frame."""
+    """Return the body's inertia (3, 3) about its hinge in the body's frame. Without a hinge, return the inertia about
+    the centre of mass."""
     arm = np.array(hold.arm)
     return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
 
 def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:
-    """Check that hinges hold free bodies, at most one to space each, fit the initial motion, and form no closed
-    chains."""
+    """Check the hinges of a scene. Hinges must belong to free bodies and must not form closed chains."""
     joined = {solid.name: {solid.name} for solid in solids}
     for index, hinge in enumerate(hinges):
         path = ("hinge", index)
@@ -159,7 +159,7 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
 
 
 def _check_joint(hinge: HingeTable, solids: Sequence[SolidTable], joined: dict[str, set[str]], path: FieldPath) -> None:
-    """Check a hinge between two solids and merge their groups in ``joined``, sets of connected solids by name."""
+    """Check a hinge between two solids. ``joined`` maps each solid to its connected solids and is updated."""
     assert hinge.to is not None
     ends = [hinge.solid, hinge.to]
     others = [solid.name for solid in solids if solid.moves and solid.name != hinge.solid]
@@ -199,7 +199,7 @@ def hinge_parameters(hinge: HingeTable, dimension: int) -> list[Parameter]:
 def number_of(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Create a scalar parameter, whose typical change is ``change`` if the value is 0 or may be negative."""
+    """Create a scalar parameter. ``change`` is the typical change of a value that is 0 or may be negative."""
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:
         return np.where((np.asarray(at) == 0.0) | (values is Range.ANY), change, np.abs(at))
@@ -208,18 +208,18 @@ def number_of(
 
 
 def in_frame(table: SolidTable, place: Any) -> Points:
-    """Convert a point (d,) of a solid at the start from the scene to the solid's frame [m]."""
+    """Convert the initial position of a point of a solid (d,) to the solid's frame [m]."""
     return np.asarray((np.array(place) - table.middle()) @ table.turn(len(place)))
 
 
 @dataclass(frozen=True)
 class Begun:
-    """Pose of a solid at the start; space itself is at the origin."""
+    """Initial pose of a solid."""
 
     middle: Points
-    """(3,) [m]"""
+    """Position of the solid's middle (3,) [m]."""
     turn: Points
-    """(3, 3) rotation matrix from the solid's frame."""
+    """Rotation matrix from the solid's frame to space (3, 3)."""
 
     @classmethod
     def of(cls, table: SolidTable | None, dimension: int) -> Self:
@@ -231,27 +231,27 @@ class Begun:
 
 @dataclass(frozen=True)
 class Link:
-    """A spring or hinge between a free body and another solid or space, with solids as indices."""
+    """A spring or hinge between a free body and a second solid or a point in space."""
 
     name: str
     body: int
-    """Index among the free bodies."""
+    """Index of the free body."""
     against: int
-    """Index of the other solid among the moving solids; -1 for a solid at rest and for space."""
+    """Index of the second solid among the moving solids; -1 if it is at rest or absent."""
     other: int
-    """Index of the other solid among the free bodies; -1 if not free."""
+    """Index of the second solid among the free bodies; -1 if it is not a free body."""
 
 
 @dataclass(frozen=True)
 class Joint(Link):
     begun: tuple[Begun, Begun]
     axis: Points | None
-    """(3,) unit vector; None for a hinge that turns about every axis."""
+    """Unit vector along the hinge's axis (3,); None for a ball joint."""
     turns: bool
 
 
 def linked(link: Any, moved: Sequence[SolidTable]) -> tuple[SolidTable, SolidTable | None, tuple[str, int, int, int]]:
-    """Return the two solids of a spring or hinge, and the fields of its `Link`; ``moved`` has all moving solids."""
+    """Return the two solids of a spring or hinge, and the fields of its `Link`. ``moved`` are all moving solids."""
     names, bodies = [one.name for one in moved], [one.name for one in moved if one.motion == "free"]
     against = names.index(link.to) if link.to in names else -1
     other = bodies.index(link.to) if link.to in bodies else -1
@@ -269,28 +269,28 @@ def joints_of(hinges: Sequence[HingeTable], moved: Sequence[SolidTable]) -> list
 
 
 class SpringTable(Table):
-    """A spring with a damper between a point of a free body and a point of another solid or of space."""
+    """A spring with a damper between a free body and a second solid or a point in space."""
 
     name: Text
-    """Name of the spring; the names of its parameters begin with it."""
+    """Name of the spring. The names of the spring's parameters begin with it."""
     solid: Text
     """Name of the free body."""
     point: Vector[Length]
-    """(d,) Position of the spring's end on the free body at the start [m]."""
+    """(d,) Initial position of the spring's end on the free body [m]."""
     to: Text | None = None
-    """Name of the solid at the other end; if left out, the other end is fixed in space."""
+    """Name of the second solid; if left out, the spring's second end is fixed in space."""
     anchor: Vector[Length]
-    """(d,) Position of the other end at the start [m]."""
+    """(d,) Initial position of the spring's second end [m]."""
     stiffness: Annotated[float, quantity("N/m", gt=0.0)]
     """Force per metre of extension [N/m]; in 2-D per metre of depth."""
     rest_length: Annotated[float, quantity("m", ge=0.0)] | None = None
-    """Length without force [m]; if left out, the length at the start."""
+    """Length of the spring without force [m]; the initial length if left out."""
     preload: Annotated[float, quantity("N")] | None = None
-    """Tension of the spring at the start [N], in place of `rest_length`."""
+    """Initial tension of the spring [N], in place of `rest_length`."""
     damping: Annotated[float, quantity("N s/m", ge=0.0)] = 0.0
-    """Force per rate of extension [N s/m]."""
+    """Damping force per rate of extension [N s/m]."""
     slack: Flag = False
-    """If true, the spring has no force while shorter than its rest length, like a mooring line."""
+    """If true, the spring pulls but never pushes, like a mooring line."""
 
     @model_validator(mode="after")
     def _check_length(self) -> Self:
@@ -305,7 +305,7 @@ class SpringTable(Table):
 
     @property
     def length(self) -> float:
-        """Return the length at the start [m]; 0 if the two ends have different dimensions."""
+        """Return the initial length [m]; 0 if `point` and `anchor` have different dimensions."""
         fits = len(self.anchor) == len(self.point)
         return float(np.linalg.norm(np.subtract(self.anchor, self.point))) if fits else 0.0
 
@@ -317,7 +317,7 @@ class SpringTable(Table):
 
 
 def check_springs(springs: Sequence[SpringTable], hinges: Sequence[HingeTable], solids: Sequence[SolidTable]) -> None:
-    """Check the solids that springs name, and that no two solids, hinges or springs have the same name."""
+    """Check that springs name existing solids, and that no two solids, hinges or springs have the same name."""
     names = [solid.name for solid in solids]
     for index, hinge in enumerate(hinges):
         if hinge.name in names:
@@ -352,19 +352,17 @@ def spring_parameters(scene: Any) -> list[Parameter]:
 class _Yielding:
     table: SolidTable
     mass: float
-    """[kg]"""
     lightest: float
     """Greatest eigenvalue of the inverse inertia [1/(kg m2)]."""
 
     def at(self, point: Any) -> float:
-        """Return a bound of the inverse effective mass for a force at a point (d,) of the body [1/kg]."""
+        """Return an upper bound on the inverse effective mass at a point (d,) of the body [1/kg]."""
         arm = np.subtract(point, self.table.middle())
         return float(1.0 / self.mass + self.lightest * (arm @ arm))
 
 
 def spring_limit(scene: Any, values: Arrays) -> float:
-    """Return the longest stable time step [s] with the scene's springs, 4 / (c + sqrt(c² + 4 w²)). The frequency w and
-    the damping rate c are upper bounds, without the added mass of water."""
+    """Return the longest stable time step [s] with the scene's springs."""
     bodies = {}
     for table in scene.solid:
         if table.motion == "free":
@@ -390,8 +388,7 @@ def spring_limit(scene: Any, values: Arrays) -> float:
 
 
 def _greatest(ends: Sequence[tuple[str, list[tuple[str, float]]]], values: Arrays, key: str) -> float:
-    """Return a bound of the greatest eigenvalue of Jᵀ M⁻¹ J K: for a spring, the sum over its bodies of the traces of
-    all springs at the body; the greatest over all springs."""
+    """Return an upper bound on the greatest eigenvalue of the springs' stiffness or damping, divided by mass."""
     traces: dict[str, float] = {}
     for name, bodies in ends:
         for body, inverse in bodies:
@@ -402,9 +399,9 @@ def _greatest(ends: Sequence[tuple[str, list[tuple[str, float]]]], values: Array
 @dataclass(frozen=True)
 class Ends(Link):
     point: Points
-    """(d,) position of the end on the body, in the body's frame [m]."""
+    """Position of the spring's end on the rigid body, in the body's frame (d,) [m]."""
     anchor: Points
-    """(d,) position of the other end [m], in the other solid's frame, or in space if that solid does not move."""
+    """Position of the spring's second end (d,) [m]: in the frame of a moving solid, else in space."""
     slack: bool
 
 

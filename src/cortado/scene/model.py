@@ -1,4 +1,4 @@
-"""The tables of a scene, and those tables that no other module defines, in SI units."""
+"""The tables of a scene for phases, mixtures, forces and discretisation, and the scene's table of tables."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,57 +24,57 @@ from cortado.scene.solvers import AnySolver, what_suits
 from cortado.scene.tables import Colour, Flag, OneOf, Several, Table, Text, Vector, count, field_error, quantity
 
 SHORTEST = 40.0
-"""Smallest default regularisation of a yield stress [s]: unyielded fluid creeps at most 2.5 % of its depth per second.
-Longer ones are too sharp for 40 particles across a plug: the speed errs by 2.7 % with 100 s, 0.8 % with 40 s."""
+"""Smallest default regularisation of a yield stress [s]."""
 
 
 class RheologyTable(Table):
-    """A law of viscosity; its numbers are parameters, such as ``carreau.flow_index``."""
+    """A law of viscosity. The law's numbers are parameters, such as ``carreau.flow_index``."""
 
     kind: str
     """Name of the law."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
-        """Return the law's numbers by name, for a phase with this viscosity [Pa s]."""
+        """Return the numbers of the law by name. ``viscosity`` is the key of the phase [Pa s]."""
         return {name: value for name, value in self.model_dump().items() if name != "kind"}
 
     def thickest(self, viscosity: float) -> float:
-        """Return the greatest viscosity [Pa s], for a phase with this viscosity [Pa s]."""
+        """Return the greatest viscosity [Pa s]. ``viscosity`` is the key of the phase [Pa s]."""
         return viscosity
 
 
 class Thinning(RheologyTable):
-    """Base of the laws of viscosity with a power of the shear rate."""
+    """Base of the laws of viscosity that have a power of the shear rate."""
 
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """n [-]: with n < 1 the fluid is shear-thinning, with n > 1 shear-thickening."""
+    """Exponent n [-]: with n < 1 the fluid is shear-thinning, with n > 1 shear-thickening."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
-    """Regularisation at rest [1/s]: the law uses sqrt(shear_rate² + least_shear_rate²) as shear rate."""
+    """Shear rate that keeps the viscosity finite at rest [1/s]. The law uses sqrt(shear_rate² + least_shear_rate²)."""
 
     def thickest(self, viscosity: float) -> float:
         return viscosity * max(self.least_shear_rate ** (self.flow_index - 1.0), 1.0)
 
 
 class PowerLaw(Thinning):
-    """The power law of Ostwald and de Waele, eta = viscosity (shear rate)^(flow_index - 1). The key `viscosity` of the
-    phase is the consistency: the viscosity at a shear rate of 1/s."""
+    """The power law of Ostwald and de Waele: the viscosity is viscosity (shear rate)^(flow_index - 1). The key
+    `viscosity` of the phase is the viscosity at a shear rate of 1/s."""
 
     kind: Literal["power_law"] = "power_law"
     """Name of the law."""
 
 
 class Carreau(RheologyTable):
-    """The law of Carreau (1972), eta = infinite_viscosity + (viscosity - infinite_viscosity) (1 + (relaxation_time
-    shear rate)^2)^((flow_index - 1) / 2). The key `viscosity` of the phase is the viscosity at rest."""
+    """The law of Carreau (1972). The viscosity is infinite_viscosity + (viscosity - infinite_viscosity) (1 +
+    (relaxation_time shear_rate)^2)^((flow_index - 1) / 2). The key `viscosity` of the phase is the viscosity at rest.
+    """
 
     kind: Literal["carreau"] = "carreau"
     """Name of the law."""
     relaxation_time: Annotated[float, quantity("s", ge=0.0)]
-    """lambda [s]: the viscosity changes at shear rates beyond 1 / lambda."""
+    """Relaxation time [s]. The viscosity changes at shear rates above its inverse."""
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """n [-], the exponent: thinner under shear for n < 1."""
+    """Exponent n [-]: with n < 1 the fluid is shear-thinning."""
     infinite_viscosity: Annotated[float, quantity("Pa s", ge=0.0)] = 0.0
-    """Viscosity at a large shear rate [Pa s]."""
+    """Viscosity in the limit of large shear rates [Pa s]."""
 
     def thickest(self, viscosity: float) -> float:
         return max(viscosity, self.infinite_viscosity)
@@ -86,8 +86,8 @@ class Yielding(RheologyTable):
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
     """Stress below which the fluid hardly flows [Pa]."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """m of Papanastasiou (1987) [s], which limits the viscosity at rest to viscosity + yield_stress m. Unyielded fluid
-    creeps at a speed of at most its depth / m. If left out: the longer of 40 s and 100 viscosity / yield_stress."""
+    """Regularisation time of Papanastasiou (1987) [s]. The viscosity at rest is viscosity + yield_stress
+    regularisation. If left out, the longer of 40 s and 100 viscosity / yield_stress."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
         growth = self.regularisation
@@ -100,15 +100,16 @@ class Yielding(RheologyTable):
 
 
 class Bingham(Yielding):
-    """The law of Bingham, smoothed as by Papanastasiou (1987): eta = viscosity + yield_stress (1 - exp(-m shear rate))
-    / shear rate. The key `viscosity` of the phase is the plastic viscosity, of fluid that flows."""
+    """The law of Bingham, smoothed as by Papanastasiou (1987). The viscosity is viscosity + yield_stress (1 -
+    exp(-regularisation shear_rate)) / shear_rate. The key `viscosity` of the phase is the viscosity of fast flow."""
 
     kind: Literal["bingham"] = "bingham"
     """Name of the law."""
 
 
 class HerschelBulkley(Yielding, Thinning):
-    """The law of Herschel and Bulkley, a power law with Bingham's yield stress: viscosity is the consistency."""
+    """The law of Herschel and Bulkley: a power law with a yield stress. The key `viscosity` of the phase is the
+    consistency."""
 
     kind: Literal["herschel_bulkley"] = "herschel_bulkley"
     """Name of the law."""
@@ -118,30 +119,30 @@ AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(di
 
 
 class MixtureTable(Table):
-    """The Cahn-Hilliard equation for the mass fractions (Yang et al. 2015), with the scene's phases in order."""
+    """The Cahn-Hilliard equation for the mass fractions of the phases (Yang et al. 2015)."""
 
     free_energy: Literal["double_well", "miscible"] = "double_well"
-    """"double_well": phases separate into pure ones; "miscible": phases mix by Fick's law."""
+    """"double_well" separates the phases; "miscible" mixes the phases by Fick's law."""
     strength: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor of the free energy, alpha."""
+    """Factor of the free energy [-]."""
     mobility: Annotated[float, quantity("m2/s", ge=0.0)] = 0.0
-    """Mobility M [m2/s]: how fast phases diffuse. With 0 there is no diffusion, and each particle keeps its phase."""
+    """Mobility of the Cahn-Hilliard equation [m2/s]. With 0 there is no diffusion between phases."""
     mobility_form: Literal["degenerate", "constant"] = "degenerate"
-    """"degenerate": phases diffuse only where they touch; "constant": everywhere equally."""
+    """With "degenerate", phases diffuse only at interfaces; with "constant", phases diffuse everywhere."""
     interface_width: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Width epsilon of an interface [m]; one spacing if left out. The mass fraction changes from 10 % to 90 % over 4.39
-    epsilon / sqrt(alpha)."""
+    """Width of an interface [m]; one spacing if left out. The mass fraction changes from 10 % to 90 % over 4.39
+    interface_width / sqrt(strength)."""
 
     def width(self, spacing: float) -> float:
         return spacing if self.interface_width is None else self.interface_width
 
 
 OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
-"""Tables of other modules that a scene file may contain."""
+"""Tables in a scene file that do not belong to the scene."""
 
 
 class DiscretisationTable(Table):
-    """Spacing, kernel and lattice of the fluid's particles."""
+    """Spacing, smoothing kernel and lattice of the fluid particles."""
 
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
@@ -149,8 +150,8 @@ class DiscretisationTable(Table):
     """Support radius / spacing: particles interact within the support radius. With the solver "projection" the default
     is 2.6 if the kernel is left out, too."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
-    """Name of the smoothing kernel. With the solver "projection" the default is "wendland_c2" if the support is left
-    out, too."""
+    """Name of the smoothing kernel. With the solver "projection" the default is "wendland_c2", unless the support is
+    given."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """Largest offset of a particle from its initial position, along each axis, in spacings; equal in all runs. With the
@@ -169,7 +170,7 @@ class Phase(Coloured):
     plain: ClassVar = (0.1, 0.3, 0.8)
 
     name: Text
-    """Name by which bodies of fluid refer to it."""
+    """Name of the phase, to which bodies of fluid refer."""
     rest_density: Annotated[float, quantity("kg/m3", gt=0.0)]
     """Density of the fluid at rest [kg/m3]."""
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
@@ -177,25 +178,26 @@ class Phase(Coloured):
     rheology: AnyRheology | None = None
     """Dependence of the viscosity on the shear rate; constant if left out."""
     material: Annotated[str, OneOf(tuple(LIQUIDS))] | None = None
-    """Look of the phase in pictures: its colour and its transparency. Simulations do not depend on it."""
+    """Material of the phase in pictures, which sets its colour and transparency. Simulations do not depend on it."""
     colour: Colour | None = None
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light: half as bright is 0.5. If left
-    out, the colour of the material, or [0.1, 0.3, 0.8] without a material."""
+    """(3,) Colour in pictures: red, green and blue from 0 to 1, in linear light. If left out, the colour of the
+    material, or [0.1, 0.3, 0.8] without a material."""
 
 
 class FixedForces(Table):
-    """The forces that every scene has."""
+    """Forces that every scene has."""
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
-    """(d,) Acceleration of all fluid by gravity [m/s2]. With schedule.gravity, it must equal the first row there."""
+    """(d,) Acceleration by gravity [m/s2]. With schedule.gravity, it must equal the schedule's first value."""
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
-    """Form of the viscous force. "stress" matches the given viscosity within 1 %, with 40 particles across a shear
-    wave, and exerts no force on fluid in rigid rotation. "pairwise" (Monaghan 2005), for the solver "pcisph" only, has
-    0.6 to 1.4 times the given viscosity, depending on the direction of the shear."""
+    """Form of the viscous force: "stress" or "pairwise", or "none" for no force. The form "stress" is accurate within 1
+    % for a shear wave with 40 particles per wavelength. It exerts no force on fluid in rigid rotation. The form
+    "pairwise" (Monaghan 2005) exists only for the solver "pcisph". Its viscosity is 0.6 to 1.4 times the given
+    viscosity, depending on the direction of the shear."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
-    """When the viscous stress is computed. "explicit": at the start of a step, which limits the time step. "implicit":
-    at the end of a step, by a system of equations, for any time step. "automatic": implicit if the time step is too
-    long for explicit."""
+    """Time integration of the viscous stress. Explicit integration limits the time step. Implicit integration solves a
+    system of equations in each step, and works with any time step. The value "automatic" means implicit if the time
+    step is too long for explicit integration."""
     pressure: Flag = True
     """Whether the fluid resists compression."""
 
@@ -209,48 +211,47 @@ Forces: Any = create_model("Forces", __base__=FixedForces, __module__=__name__, 
 
 
 def _with(given: Any, chosen: Mapping[str, Any]) -> Any:
-    """Return a table with the chosen values, or unchanged if it sets any of their keys."""
     if isinstance(given, Table) and not given.model_fields_set & set(chosen):
         return given.model_copy(update=chosen)
     return {**given, **chosen} if isinstance(given, Mapping) and not set(given) & set(chosen) else given
 
 
 class SceneTables(Table):
-    """All tables of a scene, each valid without the others."""
+    """All tables of a scene. Checks across tables follow in `Scene`."""
 
     beside: ClassVar = OTHER_TABLES
     name: Text = "scene"
     """Name of the scene, shown in titles."""
     dimension: Annotated[int, count(2, 3)]
-    """2 for a plane, 3 for space: d, the number of components of vectors."""
+    """Number d of dimensions and of components of vectors: 2 for a plane, 3 for space."""
     discretisation: DiscretisationTable
     """How the fluid is divided into particles."""
     phase: Several[Phase]
-    """The materials; mass fractions have one component for each phase, in this order."""
+    """The materials. Mass fractions have one component for each phase, in this order."""
     fluid: tuple[AnyFluid, ...] = ()
     """The bodies of fluid, in the order of their particles. A scene with an emitter may have no body of fluid."""
     emitter: tuple[EmitterTable, ...] = ()
-    """Emitters, from which fluid enters; their particles come after those of all fluids."""
+    """Emitters, from which fluid enters."""
     drain: tuple[AnyDrain, ...] = ()
-    """Drains, which take particles out of the fluid."""
+    """Drains, which remove particles from the fluid."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
     """The container of the fluid."""
     solid: tuple[AnySolid, ...] = ()
-    """Solids besides the container: obstacles in the fluid, and vessels."""
+    """Solids besides the container, such as obstacles and vessels."""
     hinge: tuple[HingeTable, ...] = ()
-    """Hinges, about which free bodies turn."""
+    """Hinges of free bodies."""
     spring: tuple[SpringTable, ...] = ()
-    """Springs, which pull free bodies."""
+    """Springs of free bodies."""
     mixture: MixtureTable = MixtureTable()
-    """How phases mix; the default if there is only one."""
+    """Diffusion between phases."""
     forces: Forces = Field(default=Forces(), validate_default=True)
-    """Which forces act."""
+    """Gravity, viscosity, pressure and Cortado's optional forces."""
     force: AnyForces = ()
-    """Forces of installed packages, which act besides the scene's own."""
+    """Additional forces from installed packages."""
     solver: AnySolver
-    """How a step is solved."""
+    """Solver and time step."""
     schedule: Schedule = Schedule()
-    """What changes while the scene runs."""
+    """Parameters that change during a run."""
     sensor: tuple[AnySensor, ...] = ()
     """Quantities of the fluid that are recorded in every step. Sensors do not influence the simulation."""
     render: Render | None = None
@@ -264,7 +265,8 @@ class SceneTables(Table):
 
     @property
     def periods(self) -> tuple[Points, Points]:
-        """Return the start and the length of the period, each (d,) [m]; the length is 0 along other axes."""
+        """Return the lower corner and the lengths of the periodic box, each (d,) [m]. The length is 0 along an axis
+        that is not periodic."""
         return self.container.periods(self.dimension)
 
     @property
@@ -278,18 +280,17 @@ class SceneTables(Table):
 
     @property
     def room(self) -> Room:
-        """Return the initial room for fluid: inside the container and outside of solids."""
+        """Return the region for fluid at the start: inside the container and outside solids."""
         return Room(self.region, solids_of(thick(self.solid)), self.periods[1])
 
     @property
     def resting_room(self) -> Room:
-        """Return the room for fluid without the moving solids."""
+        """Return the region for fluid inside the container and outside solids at rest. Moving solids are ignored."""
         return replace(self.room, solids=solids_of(tuple(solid for solid in thick(self.solid) if not solid.moves)))
 
     @model_validator(mode="before")
     @classmethod
     def _choose_for_solver(cls, data: Any) -> Any:
-        """Fill in the kernel, the support and the jitters that suit the solver, if they are not given."""
         if not isinstance(data, Mapping):
             return data
         data = dict(data)

@@ -1,4 +1,4 @@
-"""Parameters over time, moving solids, and the names of solids' state fields and parameters."""
+"""Parameters over time, moving solids, and names of solids' fields and parameters."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,24 +20,23 @@ from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error
 
 
 class Course(Table):
-    """One parameter over time, constant before the first and after the last of the given times."""
+    """Values of a parameter over time. They are constant before the first and after the last of the given times."""
 
     columns: ClassVar[Callable[[int], Columns]]
-    """Function from the number of dimensions to the columns of the parameter's file."""
+    """Function from the number of dimensions to the columns of the file."""
     grows_from: ClassVar[float | None] = 0.0
-    """Value at the start of a ramp; None means the first value."""
+    """Value at the start of a ramp; None for the first value."""
     times: Several[Annotated[float, quantity("s", ge=0.0)]] | None = None
     """(k,) Times since the first state of the run, increasing [s]."""
     values: Any = None
-    """(k, components) in the parameter's unit"""
+    """(k, components) Values in the unit of the parameter."""
     file: File | None = None
-    """A CSV file in place of `times` and `values`, with a column time [s] and a column with a unit for each component:
-    x, y and z; tilt, in 3-D tilt_x and tilt_z. A relative path starts at the scene file's folder."""
+    """A CSV file in place of `times` and `values`. It has a column time [s], and columns x, y and z, or tilt, or tilt_x
+    and tilt_z, with units. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
-    """Curve between the times: straight lines, or a cubic spline with zero slope at both ends."""
+    """Interpolation between the times: linear, or a cubic spline with zero slope at both ends."""
     ramp: Ramp | None = None
-    """Duration of the ramp [s]. Until its end values, or displacements from the first place, are multiplied by a factor
-    that grows smoothly (C2) from 0 to 1."""
+    """Duration of the ramp [s]. During the ramp the values grow smoothly (C2)."""
     _dimension: int = PrivateAttr(0)
 
     @model_validator(mode="after")
@@ -60,7 +59,7 @@ class Course(Table):
 
     @property
     def knots(self) -> Knots:
-        """Return the values (k, components) at the times; raise `InputError` for an unusable file."""
+        """Return the values (k, components) over time. Raise `InputError` for an invalid file."""
         if self.file is None:
             times, values = np.array(self.times), np.array(self.values, dtype=np.float64)
         else:
@@ -106,7 +105,7 @@ _COURSES: dict[str, Any] = {
 
 
 class _Schedule(Table):
-    """The changes of parameters while the scene runs; a parameter that is left out does not change."""
+    """The changes of parameters during a run."""
 
     @property
     def courses(self) -> dict[str, Knots]:
@@ -131,7 +130,7 @@ Schedule: Any = create_model(
 )
 
 AXES = ("turn_x", "turn_y", "turn_z")
-"""Suffixes of a free body's rotation fields: displacements of the tips of its unit axes since the start [-]."""
+"""Suffixes of the rotation fields of a free body."""
 RESTITUTION = 0.6
 
 
@@ -140,7 +139,8 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the number of each solid in wall particles: 0, 1, ... if it moves, -2, -3, ... at rest (-1: container)."""
+    """Return the number of each solid by name: 0, 1, ... for moving solids, and -2, -3, ... for solids at rest. Wall
+    particles store these numbers."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
@@ -156,14 +156,15 @@ def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the initial middles (k, d) [m] and rotation matrices (k, d, d) of the moving solids."""
+    """Return the initial positions (k, d) [m] of the middles of moving solids, and their rotation matrices (k,
+    d, d)."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """Return the greatest speed of any point of a solid [m/s]; parameters in ``values`` replace the scene's."""
+    """Return the greatest speed of a point on the solids [m/s]. Parameters in ``values`` replace the scene's."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
@@ -176,25 +177,26 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """Return a bound of the distance [m] from a solid's middle to its furthest point, for parameters ``values``."""
+    """Return an upper bound on the radius of a solid about its middle [m]. Parameters in ``values`` replace the
+    scene's."""
     furthest = np.abs(solid.own_solid().extent()).max(axis=0)
     return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
 
 position_name = ending("position")
-"""Parameter: initial position of the middle [m]; field: current position."""
+"""Parameter: initial position of the solid's middle [m]. Field: current position."""
 rotation_name = ending("rotation")
 """Parameter and field: initial rotation [rad]."""
 scale_name = ending("scale")
-"""Parameter and field: size relative to the scene's."""
+"""Parameter and field: factor of the solid's size."""
 displacement_name = ending("displacement")
-"""Parameter: displacement of the middle since the start [m]."""
+"""Parameter: displacement of the solid's middle since the start [m]."""
 turn_name = ending("turn")
 """Parameter and field: rotation since the start [rad]."""
 velocity_name = ending("velocity")
-"""Parameter: velocity of the middle, for a free body at the start [m/s]; field: a free body's velocity."""
+"""Parameter: velocity of the solid's middle, for a free body at the start [m/s]. Field: velocity of a free body."""
 angular_velocity_name = ending("angular_velocity")
-"""Parameter: angular velocity, for a free body at the start [rad/s]; field: a free body's angular velocity."""
+"""Parameter: angular velocity, for a free body at the start [rad/s]. Field: angular velocity of a free body."""
 density_name = ending("density")
 mass_name = ending("mass")
 friction_name = ending("friction")
@@ -204,12 +206,13 @@ restitution_name = ending("restitution")
 
 
 def weight_name(solid: SolidTable) -> str:
-    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg], whichever its table gives."""
+    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg]. The body's table has one of the
+    two."""
     return (density_name if solid.mass is None else mass_name)(solid.name)
 
 
 def mass_of_one(solid: SolidTable) -> Mass:
-    """Return a free body's mass and inertia for a density of 1 or a mass of 1, whichever its table gives."""
+    """Return the mass and inertia of a free body for a density of 1, or for a mass of 1 if its table has a mass."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
     if solid.inertia is not None:
@@ -229,8 +232,11 @@ def solids_in(fields: Iterable[str]) -> list[str]:
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Return the parameters of moving solids: pose, size and motion of prescribed solids; initial motion, density or
-    mass, friction and restitution of free bodies."""
+    """Return the parameters of moving solids.
+
+    Solids with prescribed motion have parameters for pose, size and motion. Rigid bodies have parameters for initial
+    motion, density or mass, friction and restitution.
+    """
     known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
     names = (position_name, rotation_name, scale_name, displacement_name, turn_name)
     found = [known[name(solid.name)] for solid in told(solids) for name in names]
@@ -288,7 +294,7 @@ def _shape_of(components: int) -> tuple[int, ...]:
 
 
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """Return the displacement [m] and rotation [rad] over time of a solid with prescribed motion, since the start."""
+    """Return the displacement [m] and the rotation [rad] over time of a solid with prescribed motion."""
     d = len(solid.middle())
     times, shifts, turns = path_of(solid, d) or (None, None, None)
 
@@ -304,25 +310,25 @@ def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a moving solid in a state, with the rotation matrix R = Q R(w), which is (3, 3) also in 2-D."""
+    """Pose of a moving solid. Its rotation matrix (3, 3) is the product of `turned` and the initial rotation."""
 
     name: str
     is_free: bool
-    """True for a free body, whose state contains the columns of Q; other solids' states contain a rotation vector."""
+    """True for a free body that the fluid moves, False for prescribed motion."""
     position: NDArray[Any]
-    """(d,) [m]"""
+    """Position of the solid's middle (d,) [m]."""
     scale: float
-    """Size relative to the scene."""
+    """Factor of the solid's size."""
     begun: NDArray[Any]
-    """w, (3,) rotation vector of the initial rotation [rad]."""
+    """Rotation vector of the initial rotation (3,) [rad]."""
     turn: NDArray[Any]
-    """(3,) rotation vector since the start [rad]; 0 for a free body."""
+    """Rotation vector since the start (3,) [rad]; 0 for a free body."""
     turned: NDArray[Any]
-    """Q, (3, 3) rotation matrix since the start."""
+    """Rotation matrix since the start (3, 3)."""
 
     @classmethod
     def of(cls, name: str, is_free: bool, at: Any) -> Self:
-        """Read the pose of a solid from the fields ``at`` of a state, which have a first axis of length 1."""
+        """Read the pose of a solid from the fields ``at`` of a state. The arrays have a first axis of length 1."""
         position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
         if is_free:
             turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
@@ -337,17 +343,18 @@ class Pose:
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """Return the rotation vector (3,) of R, in 2-D its angle (1,), from -pi to pi [rad]."""
+        """Rotation vector of the pose (3,), in 2-D its angle (1,), from -pi to pi [rad]."""
         from scipy.spatial.transform import Rotation
 
         return np.asarray(_angles(Rotation.from_matrix(self.rotation).as_rotvec(), len(self.position)).ravel())
 
     def angle_bars(self, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert the derivative with respect to `angles` into derivatives with respect to fields, by name."""
+        """Return derivatives with respect to fields by name, given the derivative ``bar`` with respect to `angles`."""
         return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert the derivative ``t`` (3,) with respect to a further rotation of R into those of fields, by name."""
+        """Return derivatives with respect to fields by name, given the derivative ``t`` (3,) with respect to a small
+        further rotation."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:
@@ -357,14 +364,13 @@ class Pose:
 
 
 def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the matrix (3, 3) of a rotation vector (3,), or of an angle (1,) in 2-D [rad]."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), or of an angle (1,) in 2-D [rad]."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(_in_space(rotation)).as_matrix())
 
 
 def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
-    """Pad a vector to (3,); an angle becomes a rotation vector about z."""
     found = np.zeros(3)
     if np.ndim(vector) == 0 or len(vector) == 1:
         found[2] = np.reshape(vector, ())
@@ -374,12 +380,11 @@ def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
-    """Convert a rotation vector w (3,) to the form of a state field, (1, 1) in 2-D or (1, 3)."""
     return np.asarray(w[2:] if dimension == 2 else w[None])
 
 
 def _jacobian(w: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the Jacobian J (3, 3) of a rotation vector w (3,): R(w + dw) is R(w) followed by the rotation J dw."""
+    """Return the left Jacobian (3, 3) of the rotation vector w (3,)."""
     size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
     if size < 1e-4:
         return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)

@@ -1,5 +1,8 @@
-"""Solvers and forces that installed packages register by entry points, for scene files to name. Entry points are read
-only for a kind that is not Cortado's. An error in a package becomes a sentence that names the package."""
+"""Solvers and forces of installed packages for scene files.
+
+Packages register solvers and forces by entry points. Entry points are read only for a kind that Cortado does not have.
+Error messages begin with the name of the package.
+"""
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -23,7 +26,7 @@ from cortado.scene.tables import MISSING, FieldPath, Flag, Table, Text, count, f
 GUARDED = "_guarded_by_cortado"
 ABSENT = object()
 OTHERS = ("builtins", "cortado", "numpy", "types", "warp")
-"""Top-level modules whose functions and classes do not belong to a user's package."""
+"""Top-level modules that are not user packages."""
 
 
 def _in_words(problem: BaseException, package: str) -> str:
@@ -40,8 +43,11 @@ def _in_words(problem: BaseException, package: str) -> str:
 def guarded(
     what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Convert an error in a package to an ``error`` whose text begins with ``what``. Cortado's errors, interruptions
-    and ``expected`` errors pass unchanged; attempts to end the process become an ``error``."""
+    """Convert an error in a package to an ``error`` with a message that begins with ``what``.
+
+    Errors of Cortado, keyboard interrupts and ``expected`` errors pass unchanged. Attempts to end the process are
+    converted.
+    """
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
         yield
@@ -52,10 +58,11 @@ def guarded(
 
 
 class PackageMaker:
-    """A solver or force from an installed package, with errors that name the package."""
+    """A solver or force of an installed package. Its error messages name the package."""
 
     def __init__(self, part: Any, kind: str, package: str):
-        """Guard a part: ``kind`` is its name in scene files, ``package`` the package's name in messages."""
+        """Wrap ``part``, a solver or force. ``kind`` is its name in scene files, and ``package`` the name of the
+        package in error messages."""
         self._part, self._kind, self._package = part, kind, package
 
     def __getattr__(self, name: str) -> Any:
@@ -93,7 +100,6 @@ class PackageMaker:
 
 
 def _at_work(made: Any, kind: str, package: str) -> Any:
-    """Guard the methods of an object that a package created, such as a solver."""
     cls: Any = type(made)
     if cls.__module__.partition(".")[0] not in OTHERS and not isinstance(made, type):
         with suppress(TypeError):  # of a class that is not Python's
@@ -103,7 +109,7 @@ def _at_work(made: Any, kind: str, package: str) -> Any:
 
 @cache
 def _guarded_class(cls: type, kind: str, package: str) -> type:
-    """Build a class of the same name whose methods are guarded, except those inherited from Cortado."""
+    """Make a subclass with methods that convert errors. Methods inherited from Cortado stay unchanged."""
     if GUARDED in cls.__dict__:
         return cls
     own: dict[str, Any] = {"__slots__": (), "__module__": cls.__module__, GUARDED: True}
@@ -135,12 +141,12 @@ def _is_ours(function: Any) -> bool:
 
 MOST = 1_000_000_000
 TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, MOST)], bool: Flag, str: Text}
-"""Checks of keys by the type of their argument."""
+"""Checks of keys by the type of a factory's argument."""
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
-    """Return the entry point with this name in a group, such as "cortado.forces". Raise a `SceneError` about ``kind``,
-    also for names in ``own``, which Cortado reserves."""
+    """Return the entry point ``kind`` in a group such as "cortado.forces". Raise a `SceneError` if no package has
+    registered ``kind``, or if ``own`` contains the name."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)
@@ -166,7 +172,7 @@ def _package_of(entry: EntryPoint) -> str:
 
 
 def loaded(entry: EntryPoint) -> Callable[..., Any]:
-    """Import the class or function that an entry point names; raise a `SceneError` about ``kind``."""
+    """Import the class or function of an entry point. Raise a `SceneError` if this fails."""
     where = f"is {shown(entry.name)}, for which {_package_of(entry)} registers {entry.value}"
     with _told("kind", entry, f"{where}, but that cannot be imported:"):
         found = entry.load()
@@ -178,7 +184,6 @@ def loaded(entry: EntryPoint) -> Callable[..., Any]:
 
 @contextmanager
 def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
-    """Convert any error in a package, including Cortado's errors, to a `SceneError` about a field."""
     try:
         with guarded(what, _package_of(entry)):
             yield
@@ -191,7 +196,8 @@ def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
-    """Return the arguments of a factory, checked by annotations; raise a `SceneError` about the first wrong key."""
+    """Return the arguments of a factory after a check of their types. Raise a `SceneError` about the first
+    invalid key."""
     arguments = _arguments(factory)
     if arguments is None:
         return dict(keys)
@@ -211,7 +217,6 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
-    """Return a function's named arguments, and ``**others`` if present; None if its signature is unknown."""
     for evaluated in (True, False):
         try:
             found = signature(factory, eval_str=evaluated).parameters
@@ -225,7 +230,6 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
 
 
 def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
-    """Return the check of a plain type or scene field type, else None, and a description of valid values."""
     annotation: Any = TYPES.get(argument.annotation) if isinstance(argument.annotation, type) else argument.annotation
     if annotation is None or get_origin(annotation) is not Annotated:
         return None, "given"
@@ -247,7 +251,8 @@ def _checked(name: str, value: Any, argument: Argument | None) -> Any:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """Build a part from the keys of a table, and check that it has the named method; raise a `SceneError`."""
+    """Make a solver or force from the keys of a table. Raise a `SceneError` if this fails, or if the object has no
+    method ``method``."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
         found = factory(**keys)
@@ -259,16 +264,17 @@ def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any]
 
 
 class PackageTable(Table):
-    """A table whose kind an installed package registers. Other keys than `kind` are arguments of its factory."""
+    """A table for a solver or force of an installed package. All keys except `kind` are arguments of the package's
+    factory."""
 
     model_config = ConfigDict(extra="allow")
     group: ClassVar[str]
     method: ClassVar[str]
     own: ClassVar[Collection[str]] = ()
-    """Names that no package can use."""
+    """Names that Cortado uses and that packages cannot use."""
     advice: ClassVar[str] = ""
     kind: Text
-    """Name of the part in the package."""
+    """Name under which the package registers the solver or force."""
 
     @model_validator(mode="before")
     @classmethod
@@ -298,14 +304,14 @@ class PackageTable(Table):
 
 
 class Inline:
-    """Mark that inlines the JSON schema of a table."""
+    """Marks a table with an inlined JSON schema."""
 
     def __get_pydantic_json_schema__(self, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"allOf": [handler.resolve_ref_schema(handler(core_schema))]}
 
 
 class PackageForce(PackageTable):
-    """A force that an installed package registers."""
+    """A force from an installed package."""
 
     group = "cortado.forces"
     method = "force"

@@ -1,7 +1,4 @@
-"""Checks of parameter values, and functions of parameter values at the start of a run. NumPy in float64.
-
-n is the number of fluid particles, in the order of the scene; d is the scene's dimension.
-"""
+"""Checks of parameter values, and the tilt of gravity, with NumPy in float64."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +13,7 @@ from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Sour
 
 
 def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
-    """Return the mixtures' rest densities m (n,) from mass fractions (n, phases) and rest densities (phases,)
+    """Return the rest densities of mixtures (n,) from mass fractions (n, phases) and rest densities (phases,)
     [kg/m3]."""
     return 1.0 / (fractions / rest_density).sum(axis=1)
 
@@ -31,27 +28,26 @@ def reference_density_tangent(
 def reference_density_adjoint(
     fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the adjoints of mass fractions (n, phases) and of rest densities (phases,) from the adjoint of m (n,)."""
+    """Return the adjoints of mass fractions (n, phases) and rest densities (phases,), given the adjoint of the
+    mixture's density (n,)."""
     by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
     return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
 
 
 SMALL = 1e-2
-"""Angles [rad] below which a series replaces a division by the angle."""
+"""Angle below which a series is used in place of a division by the angle [rad]."""
 
 
 @dataclass(frozen=True)
 class Tilt:
-    """Gravity as a function of angles a (d - 1,) [degrees]: g(a) = |g| (cos|a| e_0 + sin|a| / |a| sum_k a_k e_k), where
-    e_0 is gravity's direction without tilt.
+    """Gravity as a function of tilt angles (d - 1,) [degrees].
 
-    The unit vectors e_k are the axes except the one nearest to e_0, in order, made orthogonal to e_0 and to each other.
-    Gravity along -y leans towards x by a_1 and towards z by a_2. The map is the exponential map of the sphere, smooth
-    also at a = 0, and invertible for |a| < 180.
+    Gravity along -y turns towards x by the first angle and towards z by the second angle. The map is the exponential
+    map of the sphere. It is smooth also without tilt, and invertible for angles below 180 degrees.
     """
 
     rest: tuple[float, ...]
-    """(d,) gravity without tilt [m/s2], not 0."""
+    """Gravity without tilt (d,) [m/s2], not 0."""
 
     def gravity(self, angles: np.ndarray) -> np.ndarray:
         """Return gravity (d,) or (steps, d) [m/s2] for angles (d - 1,) or (steps, d - 1) [degrees]."""
@@ -60,7 +56,7 @@ class Tilt:
         return self._size * np.concatenate([np.cos(size), np.sinc(size / np.pi) * a], axis=-1) @ self._axes
 
     def tangent(self, angles: np.ndarray, dot: np.ndarray) -> np.ndarray:
-        """Return the tangent of `gravity` along ``dot``, of the shape of the angles [m/s2]."""
+        """Return the change of `gravity` [m/s2] for the change ``dot`` of the angles."""
         a, a_dot = np.radians(angles), np.radians(dot)
         sine, sine_derivative = self._factors(a)
         along = (a * a_dot).sum(axis=-1, keepdims=True)
@@ -71,7 +67,7 @@ class Tilt:
         )
 
     def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the adjoint of the angles [1/degree] from the adjoint of gravity."""
+        """Return the adjoint of the angles [1/degree], given the adjoint of gravity."""
         a, bars = np.radians(angles), self._size * bar @ self._axes.T
         sine, sine_derivative = self._factors(a)
         rest_bar, lean_bar = bars[..., :1], bars[..., 1:]
@@ -80,7 +76,7 @@ class Tilt:
 
     @property
     def towards(self) -> str:
-        """Return the names of the axes towards which gravity leans, such as "xz"."""
+        """Names of the axes towards which gravity turns, such as "xz"."""
         return "".join(np.delete(list("xyz"[: len(self.rest)]), np.abs(self.rest).argmax()))
 
     @property
@@ -89,7 +85,6 @@ class Tilt:
 
     @property
     def _axes(self) -> np.ndarray:
-        """Return the unit vectors e_0, e_1 ... as rows (d, d)."""
         rows = [np.array(self.rest) / self._size]
         for axis in np.delete(np.eye(len(self.rest)), np.abs(self.rest).argmax(), axis=0):
             rest = axis - sum((axis @ row) * row for row in rows)
@@ -98,7 +93,7 @@ class Tilt:
 
     @staticmethod
     def _factors(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return s = sin|a| / |a| (..., 1), and the derivative of s with respect to |a|, divided by |a|."""
+        """Return sin|a| / |a| (..., 1) for the angles a, and its derivative with respect to |a|, divided by |a|."""
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
         derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
@@ -106,13 +101,13 @@ class Tilt:
 
 
 class Known(dict[str, Parameter]):
-    """Parameters by name: the registry's, and those of forces and a solver. Two tables are equal only if identical."""
+    """Parameters by name: Cortado's parameters, and the parameters of a solver and of forces."""
 
     __eq__, __hash__ = object.__eq__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """Add the parameters ``own`` of forces and a solver, each with its owner in words; `TIME` may occur several
-        times. Raises `InputError` if two parameters share a name, or a name of kernel arguments."""
+        """Add the parameters ``own`` of forces and a solver, each with a description of the force or solver. Raises
+        `InputError` if two parameters have the same name, or if a name is reserved. `TIME` may occur several times."""
         super().__init__(BY_NAME)
         arguments = {argument(name): name for name in BY_NAME}
         for parameter, whose in dict(own).items():
@@ -126,18 +121,18 @@ class Known(dict[str, Parameter]):
             self[name] = parameter
         self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
-        """Names of the parameters on which steps depend."""
+        """Names of parameters of the time steps."""
         self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
-        """Names of the parameters of the initial state."""
+        """Names of parameters of the initial state."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
-        """Names of the parameters that may have a row for each step."""
+        """Names of parameters that may change from step to step."""
         self.vectors = tuple(name for name in self.run if self[name].components is not None)
         self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
-        """Alternative parameters, each with the name of the parameter that it replaces."""
+        """Names of alternative parameters, such as a tilt, with the names of the parameters that they replace."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
 
     def has_rows(self, name: str, value: Any) -> bool:
-        """Test whether a value has an axis of time: one row for each step or knot."""
+        """Test if a value has an entry for each step or each given time."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
@@ -160,12 +155,11 @@ TIME = Parameter(
     moment=0.0,
     course=_Passing(),
 )
-"""Parameter for forces that depend on time; kernels read it from an array (members, steps). Derivatives with respect to
-the time step include it, and a resumed run continues it."""
+"""Parameter for forces that depend on time. Kernels read it from an array (members, steps)."""
 
 
 def argument(name: str) -> str:
-    """Return a parameter's name as a kernel argument: ``drag_k`` for ``drag.k``."""
+    """Return the name of a parameter as a kernel argument, such as ``drag_k`` for ``drag.k``."""
     return name.replace(".", "_")
 
 
@@ -179,11 +173,11 @@ NAMES = names()
 UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
 OVER_TIME = names(axis=Axis.STEP)
 SUM_TOLERANCE = 0.01
-"""Allowed deviation from 1 of the sum of a particle's mass fractions, with room for finite differences."""
+"""Tolerance of the sum of a particle's mass fractions."""
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Return the scene's values of ``known`` parameters, as users write them, without alternatives such as a tilt."""
+    """Return the scene's values of the ``known`` parameters, without alternatives such as a tilt."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():
@@ -194,7 +188,7 @@ def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
 
 
 def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
-    """Raise `InputError` for a parameter that does not exist, or that the scene does not have."""
+    """Raise `InputError` for a parameter that does not exist in this scene."""
     if name not in known or known[name].role is Role.CLOCK:
         owner = str(name).rpartition(".")[0]
         if owner in (solid.name for solid in scene.solid if not solid.moves):
@@ -208,7 +202,8 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 
 def require_points(points: Any, are_read: bool = True) -> None:
-    """Raise `InputError` for anything but tables of parameters; the entries of an iterable are not read if told so."""
+    """Raise `InputError` if ``points`` is not a list of tables of parameters. If ``are_read`` is false, ``points`` may
+    be any iterable, and the tables are not checked."""
     is_fit = isinstance(points, Sequence) and len(points) > 0 if are_read else isinstance(points, Iterable)
     if not is_fit or isinstance(points, (str, bytes, Mapping)):
         raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")
@@ -225,8 +220,11 @@ def is_too_small(array: np.ndarray, allowed: Range) -> bool:
 def checked_value(
     name: str, value: Any, shapes: list[tuple[int, ...]], what: str = "parameter", known: Known = REGISTRY
 ) -> np.ndarray:
-    """Return a value as a finite float64 array of one of the shapes, in range. Raise `InputError`, or `OutOfRangeError`
-    if only the numbers are wrong. If ``what`` is "direction", numbers may be negative."""
+    """Return a value as a float64 array, after a check of its shape and range.
+
+    Raise `OutOfRangeError` if only the numbers are invalid, else `InputError`. Numbers may be negative if ``what`` is
+    "direction".
+    """
     array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""
     if array.shape not in shapes:

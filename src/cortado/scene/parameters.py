@@ -1,4 +1,4 @@
-"""Registry of parameters, with units, shapes, ranges and values in a scene, and of the quantities of particles."""
+"""Registry of parameters and registry of particle quantities, with units, shapes and valid ranges."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from cortado.errors import InputError, shown
 
 
 class Axis(Enum):
-    """Owner of each entry of a parameter: a phase, step or particle, or the whole run."""
+    """The axis along which a parameter's values differ: phases, steps, particles or none."""
 
     SCALAR = "one number"
     PHASE = "each phase"
@@ -47,18 +47,18 @@ class Source(Protocol):
 
 class Changing(Protocol):
     def at(self, times: NDArray) -> NDArray:
-        """Return numbers (n,) or (n, components) at times (n,) [s]."""
+        """Return values (n,) or (n, components) at times (n,) [s]."""
 
     def rates(self, times: NDArray) -> NDArray: ...
 
 
 Limit = Callable[[Any, Mapping[str, Any]], float]
-"""Function from a scene, and values of parameters that replace the scene's, to a time step [s]."""
+"""Function from a scene and parameter values to the longest time step [s]."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """An input of a run, or of its loss."""
+    """An input of a run or of a loss, with its unit, shape and valid range."""
 
     name: str
     unit: str
@@ -70,34 +70,34 @@ class Parameter:
     role: Role = Role.RUN
     range: Range = Range.ANY
     change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
-    """Function from a scene and a value to a typical large change for an optimiser; the default is the value."""
+    """Function from a scene and a value to the size of a typical change."""
     acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
-    """Function that tests whether the parameter has any effect in a scene, with values of parameters by name."""
+    """Function from a scene and parameter values by name to True if the parameter has an effect."""
     present: Callable[[Any], bool] = lambda scene: True
     absent: str = ""
-    """Words about a scene without the parameter, such as "has only one phase"."""
+    """Reason why a scene may lack the parameter, such as "has only one phase"."""
     force: str | None = None
-    """Module whose ``force`` builds the force that uses the parameter: see `cortado.sph.parts`."""
+    """Module of the force that uses the parameter."""
     is_optional: bool = False
-    """True for a key of [forces] that may be left out, together with its force."""
+    """True for a parameter of an optional force."""
     longest_step: Limit = lambda scene, values: inf
     moment: float = 0.5
-    """Time within a step, from 0 (start) to 1 (end), at which a schedule is evaluated for the step's row."""
+    """Time within a step at which values over time are read, from 0 for its start to 1 for its end."""
     grows: bool = False
-    """True if a parameter over time is 0 at the start of a run, and a steady change of it grows."""
+    """True for a displacement from the start of a run."""
     in_place_of: str | None = None
-    """Name of the parameter that this one replaces if given."""
+    """Name of the parameter that this alternative parameter replaces."""
     course: Changing | None = None
     """Default values over time."""
     shape: tuple[int, ...] = ()
 
     @property
     def rank(self) -> int:
-        """Return the number of axes of the value for one step, phase or particle: 1 for a vector."""
+        """Number of axes of a single value, such as 1 for a vector."""
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """Return the allowed shapes of a value, () for a scalar; ``positions`` is the shape (n, d) of positions."""
+        """Return the allowed shapes of a value. ``positions`` is the shape (n, d) of positions."""
         if self.axis is Axis.ARRAY:
             return [self.shape]
         particles, dimension = positions
@@ -115,7 +115,7 @@ def _vector(dimension: int, phases: int) -> int:
 
 
 def of_part(name: str, unit: str, meaning: str, value: Any, axis: Axis = Axis.SCALAR, **more: Any) -> Parameter:
-    """Build the parameter of a part of a scene, such as a solid, whose value is a number or a vector (d,)."""
+    """Build the parameter of a part of a scene, such as a solid."""
     own = np.asarray(value, dtype=np.float64)
     return Parameter(name, unit, meaning, axis, lambda source: own, components=_vector if own.ndim else None, **more)
 
@@ -142,27 +142,24 @@ def _diffuses(source: Source, values: Mapping[str, NDArray]) -> bool:
 
 
 def _of_particles(name: str, unit: str, meaning: str, value: Callable[[Source], Any], **more: Any) -> Parameter:
-    """Build a parameter of the first state of particles, by default a vector."""
+    """Build a parameter of the particles' initial state."""
     more = {"components": _vector, "role": Role.STATE, **more}
     return Parameter(name, unit, meaning, Axis.PARTICLE, value, **more)
 
 
 def _of_phases(name: str, unit: str, meaning: str, key: str = "", **more: Any) -> Parameter:
-    """Build the parameter of a key of phases, by default of the same name."""
+    """Build a parameter from a key of the phases."""
     of_each = attrgetter(key or name)
     return Parameter(name, unit, meaning, Axis.PHASE, lambda s: list(map(of_each, s.scene.phase)), **more)
 
 
 def _of_mixture(name: str, unit: str, meaning: str, value: Callable[[Source], Any], allowed: Range) -> Parameter:
-    """Build a parameter of the diffusion between phases."""
     own: Any = {"acts": _diffuses, "present": _has_several_phases, "absent": "has only one phase", "range": allowed}
     return Parameter(name, unit, meaning, Axis.SCALAR, value, **own)
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
-    """Return C sqrt(rho s³ / sigma) for the lightest phase and the spacing s, the longest stable time step with surface
-    tension (Brackbill et al. 1992). C is 0.08 for PCISPH, which needs many more iterations from 0.1 on, and else
-    0.2."""
+    """Return the longest stable time step with surface tension [s] (Brackbill et al. 1992)."""
     tension = float(values.get("surface_tension", scene.forces.surface_tension))
     density = float(np.min(values.get("rest_density", [phase.rest_density for phase in scene.phase])))
     part = 0.08 if scene.solver.kind == "pcisph" else 0.2
@@ -172,7 +169,6 @@ def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
 def _optional(
     name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
 ) -> Parameter:
-    """Build the parameter of a number >= 0 in [forces], which switches on the force of the module ``force``."""
     return Parameter(
         name,
         unit,
@@ -280,7 +276,7 @@ def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]
 
 
 def offered(scene: Any) -> tuple[str, ...]:
-    """Return the names of the parameters of a scene, without mass fractions if it has one phase."""
+    """Return the names of the parameters that a scene has."""
     one_phase = {"mass_fractions"} if len(scene.phase) == 1 else set()
     return tuple(p.name for p in PARAMETERS if p.present(scene) and p.name not in one_phase)
 
@@ -293,7 +289,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of each particle, computed from a state and the parameters of the next step."""
+    """A particle quantity that is computed from a state and parameters."""
 
     name: str
     unit: str
@@ -319,14 +315,14 @@ NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return the values (..., n) of a scalar quantity or state field, or the norms of vectors (..., n, k)."""
+    """Return scalar values (..., n) unchanged, or the norms of vectors (..., n, k). ``name`` is a quantity or
+    a field."""
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
 
 
 def ending(end: str) -> Callable[[str], str]:
-    """Return the function that appends an ending to a name, for the names of parameters and state fields."""
     return lambda name: f"{name}.{end}"
 
 
@@ -334,22 +330,22 @@ LOAD = ".load"
 
 
 def load_name(solid: str) -> str:
-    """Return the name of the fluid's load on a solid: force [N], then torque [N m]; in 2-D [N/m] and [N]."""
+    """Return the name of a fluid load on a solid: force [N] and torque [N m], in 2-D [N/m] and [N]."""
     return f"{solid}{LOAD}"
 
 
 def is_load(name: object) -> bool:
-    """Test whether a name has the form of a load's name; the solid may not exist."""
+    """Test if a name has the form that `load_name` returns."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """Return the name of a quantity, of one of the ``fields``, or of a load on a solid; else raise `InputError`."""
+    """Return ``name`` if it is a quantity, one of ``fields``, or a load on a solid; else raise `InputError`."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
-    """Return the name of a quantity or one of ``others``; raise `InputError` for any other."""
+    """Return ``name`` if it is a quantity or one of ``others``; else raise `InputError`."""
     if not isinstance(name, str) or name not in (*others, *NAMES):
         raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
     return name

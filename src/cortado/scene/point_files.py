@@ -1,9 +1,9 @@
-"""Points from files: NumPy arrays, and the formats that VTK reads.
+"""Reads points from NumPy files and from the formats of VTK.
 
 VTK and HDF5 trust the contents of a file: a damaged file may make them hang, use all memory or crash. A separate
-process, ``python -m cortado.scene.point_files FILE``, therefore reads such files within limits. The process writes the
-points (n, 3) or (n, 2) in NumPy's format to standard output, or the reason for refusing the file with the exit code
-`REFUSED`.
+process, ``python -m cortado.scene.point_files FILE``, therefore reads VTK and HDF5 files within limits. The process
+writes the points (n, 3) or (n, 2) in NumPy's format to standard output. If it refuses a file, it writes the reason and
+ends with the exit code `REFUSED`.
 """
 
 import io
@@ -26,11 +26,11 @@ from cortado.files.disk import cached_by_file, reason
 MOST_POINTS = 10_000_000
 REFUSED = 3
 ROOM = 2**30
-"""Memory that the process may use beyond 20 times the file's size [byte]."""
+"""Additional memory for the reading process, besides 20 times the size of the file [byte]."""
 
 
 class Refused(Exception):
-    """The reason why a file with points cannot be used, as a clause."""
+    """The reason why a file of points cannot be used."""
 
 
 def _by_vtk(path: str) -> Any:
@@ -54,7 +54,7 @@ def _by_vtk(path: str) -> Any:
 
 
 def _hdf5(path: str) -> Any:
-    """Read the points of all parts of the first time step; files from Cortado must have valid checksums."""
+    """Read the points of the first time step."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -109,7 +109,7 @@ def _limit_memory(size: int) -> None:
 
 
 def main(path: str) -> int:
-    """Read a file of points and write them for the parent process; return the exit code."""
+    """Read a file of points, write them for the parent process, and return the exit code."""
     output, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     for terminal in (1, 2):
         os.dup2(nothing, terminal)
@@ -129,11 +129,11 @@ def main(path: str) -> int:
 SUFFIXES = (".npy", *READERS)
 MOST_POINT_BYTES = 2**30
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
-"""Time limit for reading a file: the first number [s], plus the file's size over the second [byte/s]."""
+"""Fixed part of the time limit for reading a file [s], and number of bytes per additional second [byte/s]."""
 
 
 def read_points(path: str, dimension: int) -> Points:
-    """Read points (n, d) [m] from a file, read-only; raise `InputError` with the file's name."""
+    """Read points (n, d) [m] from a file, as a read-only array. Raise `InputError` with the name of the file."""
     if Path(path).suffix not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}.")
     return _read(path, dimension)
@@ -160,7 +160,7 @@ def _check_form(path: str, shape: tuple[int, ...], dtype: np.dtype[Any], dimensi
 
 
 def _read_npy(path: str, dimension: int) -> Any:
-    """Read the array of a NumPy file, after a check that its header agrees with the size of the file."""
+    """Read the array of a NumPy file."""
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     try:
         with open(path, "rb") as file, warnings.catch_warnings():

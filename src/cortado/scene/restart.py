@@ -1,4 +1,4 @@
-"""States from which a later run continues an earlier one bit for bit, and the times of these states."""
+"""States from which a later run continues exactly (bit for bit), and their times."""
 
 import json
 from collections.abc import Mapping
@@ -14,36 +14,35 @@ from cortado.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Clock:
-    """Time of a state since the first state of the first run."""
+    """Time of a state since the first state."""
 
     steps: int = 0
     """Number of steps since the first state."""
     time: float = 0.0
     """Time since the first state [s]."""
     time_step: float = field(default=0.0, repr=False)
-    """Length of the previous step, which bounds the next one, if steps are adaptive [s]; otherwise 0."""
+    """Length of the last adaptive time step [s]; 0 for fixed time steps."""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """Return times (frames,) [s] after more ``steps`` (frames,) of ``time_step`` [s], bit for bit as without a
-        break."""
+        """Return the times (frames,) [s] after ``steps`` (frames,) further steps of length ``time_step`` [s]."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
     def after(self, steps: int, time_step: float) -> "Clock":
-        """Return the clock of the state ``steps`` steps later."""
+        """Return the clock after ``steps`` further steps."""
         return Clock(self.steps + steps, float(self.times(np.array(steps), time_step)))
 
 
 @dataclass(frozen=True)
 class RecordedClock(Clock):
-    """Clock of the first state of a run with adaptive, recorded time steps."""
+    """Clock of a run with adaptive time steps."""
 
     recorded: NDArray = field(default_factory=lambda: np.zeros(1), repr=False, compare=False)
-    """(steps + 1,) time of each state [s]; undefined for states that the run did not reach."""
+    """Time of each state (steps + 1,) [s]."""
     sizes: NDArray = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
-    """(steps,) length of each step [s]."""
+    """Length of each step (steps,) [s]."""
 
     def times(self, steps: NDArray, time_step: float) -> NDArray:
-        """Return times (frames,) [s] after ``steps`` more steps, interpolated within steps; ``time_step`` is unused."""
+        """Return the times (frames,) [s] after ``steps`` further steps; ``time_step`` is ignored."""
         return np.interp(steps, np.arange(len(self.recorded)), self.recorded)
 
     def after(self, steps: int, time_step: float) -> Clock:
@@ -54,28 +53,28 @@ class RecordedClock(Clock):
 
 @dataclass(frozen=True)
 class Origin:
-    """Properties of a state's particles that every run which continues from the state must share."""
+    """Properties of the scene that made a state. A run from the state needs a scene with equal properties."""
 
     spacing: float
-    """[m]"""
+    """Particle spacing [m]."""
     support: float
-    """[spacings]"""
+    """Support radius of the smoothing kernel [spacings]."""
     kernel: str
     periods: tuple[float, ...]
-    """(d,) lengths of the periods [m]; 0 along an axis that is not periodic."""
+    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
     waiting: tuple[int, ...]
-    """Number of particles of each emitter; these are the last particles."""
+    """Number of particles of each emitter."""
     rest_density: tuple[float, ...]
-    """(phases,) rest densities of the run [kg/m3]."""
+    """Rest density of each phase (phases,) [kg/m3]."""
     solver: str | None = None
-    """Name of the solver, for messages, if the state has fields of this solver; None without such fields."""
+    """Name of the solver if the state has fields of the solver, else None."""
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> "Origin":
-        """Read the JSON of `to_json`; raise `ValueError` or `TypeError` for any other text."""
+        """Read the JSON of `to_json`. Raise `ValueError` or `TypeError` for invalid text."""
         read: dict[str, Any] = json.loads(text)
         values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in read.items()}
         return cls(**values)
@@ -83,20 +82,22 @@ class Origin:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestartState(ShortRepr):
-    """The complete state at the end of a step: `Trajectory.last_state` returns it, `Simulation.run` accepts it."""
+    """The complete state at the end of a step. `Trajectory.last_state` returns it, and `Simulation.run` accepts it."""
 
     fields: Mapping[str, NDArray]
-    """Arrays by field name: positions [m] and velocities [m/s], (n, d); mass_fractions (n, phases); reference_density
-    (n,), each particle's mass divided by its volume on the rest lattice [kg/m3]. For each emitter NAME.outlet (1, d) is
-    the position of its opening [m], and NAME.emitted (1,) the length of fluid that has left it [m]. Solvers other than
-    PCISPH may add fields that they carry from step to step."""
+    """Arrays by field name.
+
+    These are positions (n, d) [m], velocities (n, d) [m/s], mass_fractions (n, phases), and reference_density (n,), the
+    mass of a particle divided by its volume on the rest lattice [kg/m3]. For each emitter, NAME.outlet (1, d) is the
+    position of its opening [m], and NAME.emitted (1,) the length of the emitted column [m]. Some solvers add fields.
+    """
     clock: Clock = field(default_factory=Clock)
     """Time of the state."""
     origin: Origin | None = None
-    """Origin of the particles; None for a state that a user built, or that an earlier version wrote."""
+    """Properties of the scene that made the state; None if unknown."""
 
     def __getitem__(self, name: str) -> NDArray:
-        """Return a field by name; raise `InputError` for an unknown field."""
+        """Return a field by name. Raise `InputError` for an unknown field."""
         if name not in self.fields:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.fields)}.")
         return self.fields[name]

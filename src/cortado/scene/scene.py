@@ -1,4 +1,4 @@
-"""Scenes, overrides of their values, and warnings about numbers that may be in another unit."""
+"""Scenes, replacements of their values, and warnings about values in a wrong unit."""
 
 import json
 import os
@@ -31,7 +31,7 @@ class Scene(SceneTables):
     """A scene, from which a simulation starts.
 
     Arguments are the keys of a scene file. A table such as [discretisation] is a dict, and tables such as [[phase]] are
-    a list of dicts. A missing or wrong value raises a `SceneError`. Scenes are immutable: `replaced` returns another
+    a list of dicts. A missing or invalid value raises a `SceneError`. Scenes are immutable: `replaced` returns another
     scene, with all checks. Pydantic's ``model_copy(update=...)`` would skip the checks.
 
     Example::
@@ -64,19 +64,18 @@ class Scene(SceneTables):
         return self
 
     def replaced(self, *overrides: str) -> "Scene":
-        """Return the scene with other values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
+        """Return the scene with new values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
-        Overrides are written as for `load_scene`; a relative file name in an override starts at the current folder.
+        Overrides are written as for `load_scene`. A relative file name in an override starts at the current folder.
         Raises `SceneError` as `load_scene` does.
         """
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
-        """Return the scene with emitters that have enough fluid for a time [s], or for ``steps`` steps.
+        """Return the scene with enough fluid in its emitters for ``time`` [s], or for ``steps`` steps.
 
-        An emitter is unchanged if it has a volume, is fed by drains, or has a long enough column. If all axes are
-        periodic the scene is unchanged, because there is no place for a reserve. Raises `InputError` if the particles
-        would not fit into memory.
+        An emitter is unchanged if it has a volume, is fed by drains, or has a long enough column. The scene is
+        unchanged if all axes are periodic. Raises `InputError` if the particles would not fit into memory.
         """
         spacing = self.discretisation.spacing
         if steps is not None:
@@ -93,7 +92,7 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """Return the scene with as many particles in emitters as the run from which a state comes."""
+        """Return the scene with as much fluid in emitters as in the run that made ``state``."""
         origin, spacing, made = state.origin, self.discretisation.spacing, list(self.emitter)
         if origin is None or len(origin.waiting) != len(made):
             return self
@@ -103,13 +102,12 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": tuple(made)})
 
     def to_json(self) -> str:
-        """Return the scene as JSON, for `from_json`, with all defaults except colours that follow from materials."""
+        """Return the scene with its default values as JSON, which `from_json` reads."""
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """Return the part of the scene on which results depend as JSON. Left out are [picture], [[sensor]] and
-        materials; empty lists of [[force]], [[solid]], [[hinge]], [[spring]], [[emitter]] and [[drain]]; a jitter of 0;
-        keys of adaptive time steps if steps are fixed; and options of the projection that are off."""
+        """Return as JSON the part of the scene that determines the results of a simulation. Pictures, sensors and
+        materials are left out."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         lists = ("force", "solid", "hinge", "spring", "emitter", "drain")
         aside |= {name: True for name in lists if not getattr(self, name)}
@@ -124,8 +122,8 @@ class Scene(SceneTables):
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
-        """Read a scene from the JSON ``text`` of `to_json`, with overrides as for `load_scene`; ``file`` is its name in
-        errors."""
+        """Read a scene from the JSON of `to_json`, with overrides as for `load_scene`. Errors refer to the scene as
+        ``file``."""
         if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
@@ -154,8 +152,6 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
 
 
 def _millimetres(scene: SceneTables) -> str | None:
-    """Return a warning about lengths in millimetres if the fluid is very heavy and gravity the Earth's in metres; else
-    None."""
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
@@ -181,7 +177,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
         overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
 
     Raises:
-        SceneError: in one sentence, with the file, the field, the value found and the values allowed.
+        SceneError: one sentence with the file, the field, the value found and the allowed values.
 
     Example: ``scene = cortado.load_scene("dam.toml", ["solver.time_step=0.001"])``
     """
@@ -189,7 +185,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """Return a scene unchanged, or the scene in the file at a path; raise `InputError` otherwise."""
+    """Return a scene unchanged, or read the scene file at a path. Raise `InputError` for an object of any
+    other type."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, (str, os.PathLike)):
@@ -198,7 +195,7 @@ def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
 
 
 def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
-    """Build a scene from the contents of its file, in whose folder other files are."""
+    """Make a scene from the contents of its file. Relative paths in the scene start at the folder of ``file``."""
     if isinstance(data, Mapping):
         data = {key: value for key, value in data.items() if key not in OTHER_TABLES}
     folder = Path(file).parent if file else Path()
@@ -210,7 +207,7 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """Return the tables of `Scene.to_json` that name a file, each with the key of the file."""
+    """Return all tables with a key for a file, each with the name of the key. ``tables`` are as in `Scene.to_json`."""
     found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
     found += [one["path"] for one in tables.get("emitter") or ()]
     return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
@@ -247,16 +244,15 @@ def _held(scene: Scene) -> str:
 
 
 MOST_BYTES = 1_000_000
-"""Largest size of a file [byte]; the worst TOML of this size takes a few seconds and some hundred MB."""
+"""Greatest size of a scene file [byte]."""
 MOST_PARTS = 10
-"""Most parts of a dotted key; the time to parse a key grows with the square."""
+"""Greatest number of parts of a dotted key."""
 
 _ASIDE = re.compile(
     r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
     r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
     re.DOTALL,
 )
-"""Comments and quoted texts, including unfinished ones."""
 _TOO_DEEP = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_PARTS}}}[\w-]++")
 _TWICE = re.compile(r"Cannot declare \('(fluid|phase)',\) twice")
 _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
@@ -265,12 +261,12 @@ _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 def read_toml(
     path: str | os.PathLike[str], overrides: Sequence[str] = (), unread: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Read a TOML file and return its contents with overrides applied. Raises `SceneError`, also for an override of a
-    table in ``unread``.
+    """Read a TOML file and return its contents with overrides applied. Raises `SceneError`. Tables in ``unread`` cannot
+    be overridden.
 
     An override is ``key=value``, such as ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or
-    ``fluid[0].upper=[1,1,1]``. A list entry can have its name in place of its index, ``phase.oil.viscosity=0.1``. A
-    value that is not TOML becomes text.
+    ``fluid[0].upper=[1,1,1]``. A list entry can be given by its name in place of its index:
+    ``phase.oil.viscosity=0.1``. A value that is not TOML becomes text.
     """
     file = as_path("path", path)
     try:
@@ -302,7 +298,7 @@ def _table_of(override: str) -> str:
 
 
 def _beside(file: str) -> str | None:
-    """Return the scene file whose name is closest to that of a missing file beside it; None if none is close."""
+    """Return the scene file with the most similar name in the folder of a missing file, or None."""
     folder, name = os.path.split(file)
     try:
         names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]
@@ -313,7 +309,7 @@ def _beside(file: str) -> str | None:
 
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Sequence[str] = ()) -> dict[str, Any]:
-    """Apply overrides to the contents of a file; raise `SceneError`, also for an override of a table in ``unread``."""
+    """Apply overrides to the contents of a file. Raise `SceneError` for an invalid override."""
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)
@@ -335,7 +331,7 @@ def _unreadable(file: str, sentence: str) -> SceneError:
 
 
 def _require_shallow(text: str, file: str) -> None:
-    """Raise `SceneError` for a dotted key with too many parts, before the text is parsed."""
+    """Raise `SceneError` for a dotted key with too many parts. Call this before the parser."""
     plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
     deep = _TOO_DEEP.search(plain)
     if deep:
@@ -377,7 +373,6 @@ def _short(key: str) -> str:
 
 
 def _entry(tables: list[Any], part: str) -> int | None:
-    """Return the index of a list entry from its index or its name as text; None for an unknown entry."""
     if part.isdecimal():
         return int(part) if len(part) <= 9 and int(part) < len(tables) else None
     return next((k for k, table in enumerate(tables) if part in _names([table])), None)
@@ -397,7 +392,6 @@ def _names(tables: list[Any]) -> list[str]:
 
 
 def _value(text: str) -> Any:
-    """Parse a text as a TOML value; return the text if it is not TOML."""
     try:
         parsed = tomllib.loads(f"value = {text}")
     except (ValueError, RecursionError):

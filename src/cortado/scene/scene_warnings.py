@@ -1,4 +1,4 @@
-"""Warnings about scenes that may not do what the user means: keys without effect, and inaccurate physics."""
+"""Warnings about keys without effect and about inaccurate physics."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -29,7 +29,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Yield the names of fields whose values differ from their defaults, out of ``names``."""
+    """Yield the field ``names`` that do not have their default values."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -37,21 +37,21 @@ def given(table: Table, *names: str) -> Iterator[str]:
 
 
 def check_idle(scene: SceneTables) -> None:
-    """Raise a `field_error` for the first key that has no effect because of another key."""
+    """Raise a `field_error` for the first key without effect."""
     for path, table, names, reason in _idle(scene):
         for name in given(table, *names):
             raise field_error((*path, name), getattr(table, name), f"left out, as {reason}")
 
 
 def idle_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield sentences about keys that have no effect because another number is 0."""
+    """Yield warnings about keys without effect."""
     for path, table, names, reason in _turned_off(scene):
         for name in given(table, *names):
             yield f"{field_name((*path, name))} changes nothing, as {reason}."
 
 
 Idle = tuple[FieldPath, Table, tuple[str, ...], str]
-"""Path of a table, the table, the names of its keys without effect, and the reason."""
+"""Path of a table, the table, the names of keys without effect, and the reason."""
 
 
 def _idle(scene: SceneTables) -> Iterator[Idle]:
@@ -123,11 +123,7 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
 
 
 def creep_sentence(scene: SceneTables) -> str | None:
-    """Return a sentence about creeping fluid with a yield stress; None without yield stress or initial fluid.
-
-    A film of depth H with the ``regularisation`` m has the surface speed (H / m) (1 + (1 - r) ln(1 - r) / r) <= H / m,
-    where r <= 1 is the wall stress over the yield stress.
-    """
+    """Return a warning about the creep of fluid with a yield stress, or None."""
     phase, law = scene.phase[0], scene.phase[0].rheology
     if not isinstance(law, Yielding) or law.yield_stress == 0.0 or not scene.fluid:
         return None
@@ -142,7 +138,7 @@ def creep_sentence(scene: SceneTables) -> str | None:
 
 
 def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
-    """Return a sentence about the inaccurate viscosity form, ``where`` it matters; None for other forms."""
+    """Return a warning about the inaccurate pairwise viscosity, or None. ``where`` tells where the error matters."""
     if scene.forces.viscosity != "pairwise":
         return None
     fault = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
@@ -150,13 +146,13 @@ def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
 
 
 THROUGH = 1.5
-"""Smallest length by which a solid must extend through a wall so that fluid in the corner rests [spacings]."""
+"""Smallest extension of a solid through a wall [spacings]."""
 FACING = 0.9
-"""Smallest component of a face's unit normal along an axis to which the face counts as perpendicular."""
+"""Smallest component of a unit normal along an axis for a face perpendicular to the axis."""
 
 
 def standing_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield a sentence for each flat wall of the container on which a solid ends and along which it moves."""
+    """Yield warnings about moving solids that end at a flat wall of the container."""
     box = scene.container
     if not isinstance(box, BoxContainer):
         return
@@ -179,7 +175,6 @@ def standing_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
-    """Test whether a solid is not rotated by its path and keeps its distance from a wall across an axis."""
     shifts, turns = courses(table)
     if turns.greatest() > 0.0:
         return False
@@ -189,17 +184,17 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 
 
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
-"""Smallest thickness of walls without leaks [spacings], with one and with two layers of wall particles."""
+"""Smallest thickness of a leak-proof solid, for one and for two layers of wall particles [spacings]."""
 DEPTHS = np.arange(1, 9) / 8.0
-"""Fractions of this thickness at which the solid is tested below its surface."""
+"""Test depths below the surface of a solid, as fractions of the smallest thickness."""
 MARGIN = 1e-3
-"""Fraction of this thickness by which a wall may be too thin."""
+"""Tolerance of the thickness, as a fraction of the smallest thickness."""
 SHARE = 0.01
 """Fraction of the surface that may be too thin without a warning."""
 
 
 def thin_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield a sentence for each solid with fluid on both sides that is too thin to hold it back."""
+    """Yield warnings about solids that are too thin to separate the fluid on their two sides."""
     cut = scene.discretisation
     spacing, least = cut.spacing, (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
     for table in thick(scene.solid) if scene.forces.pressure else ():

@@ -1,4 +1,4 @@
-"""Words from the JSON schema of tables: valid values, units of keys, and the list of keys in the help of a table."""
+"""Texts about the keys of tables, from their JSON schema: valid values, units and help."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +18,7 @@ else:
     ModelMetaclass = type(BaseModel)
 
 GREATEST = 1e50
-"""Largest number in a scene, whose cube fits into a float64; its inverse is the smallest positive number."""
+"""Greatest number in a scene. Its inverse is the smallest positive number."""
 Schema = Mapping[str, Any]
 
 
@@ -69,8 +69,8 @@ def _limits(schema: Schema) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit of a scene's value with a dotted key, such as "Pa s" for ``phase.0.viscosity``; empty without a
-    unit, or if the key has different units in different shapes."""
+    """Return the unit of a dotted key, such as "Pa s" for ``phase.0.viscosity``. Return an empty text for a key without
+    a unique unit."""
     found = list(_choices(_schema()))
     for part in key.split("."):
         found = [choice for one in found for choice in _choices(_part(one, part))]
@@ -102,7 +102,7 @@ _HOMES: dict[str, str] = {}  # modules of tables by name
 
 
 class Documented(ModelMetaclass):
-    """Metaclass of tables, whose help lists the keys from the shipped schema."""
+    """Metaclass of tables that lists the keys of a table in its help."""
 
     def __init__(cls, name: str, *arguments: Any, **named: Any):
         super().__init__(name, *arguments, **named)
@@ -118,7 +118,7 @@ class Documented(ModelMetaclass):
 
     @property
     def __signature__(cls) -> Signature:
-        """Return the keys with their defaults; an optional table has the default {}."""
+        """Signature with the keys and their default values."""
         found = []
         for name, field in vars(cls)["__pydantic_fields__"].items():
             default = Parameter.empty if field.is_required() else field.get_default(call_default_factory=True)
@@ -128,7 +128,7 @@ class Documented(ModelMetaclass):
 
     @__signature__.setter
     def __signature__(cls, value: Any) -> None:
-        """Ignore pydantic's signature, which has annotations."""
+        """Ignore the signature that pydantic sets."""
 
 
 def _line(key: str, schema: Schema, is_needed: bool) -> str:
@@ -143,7 +143,6 @@ def _line(key: str, schema: Schema, is_needed: bool) -> str:
 
 
 def _tables(schema: Schema, what: str) -> str:
-    """Name the tables that a key accepts, with their module; return an empty text for a key without tables."""
     names = [one["$ref"].rpartition("/")[2] for one in (schema, *schema.get("oneOf", ())) if "$ref" in one]
     there = [name for name in names if hasattr(modules.get(_HOMES.get(name, "")), name)]
     return f"{what}, {_HOMES[there[0]]}.{' or '.join(there)}" if there else what if names else ""

@@ -17,12 +17,11 @@ class SensorTable(Table):
     """A sensor that records numbers of the fluid in every step."""
 
     name: Text
-    """Name of the sensor; the names of its columns in sensors.csv begin with it."""
+    """Name of the sensor. The names of its columns in sensors.csv begin with it."""
 
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        """Refuse a name that a spreadsheet takes for a formula, also with a full-width sign."""
         plain = unicodedata.normalize("NFKC", name).strip()
         if plain[:1] in tuple("=+-@") or not name.isprintable():
             wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
@@ -42,28 +41,28 @@ class PressureProbeTable(SensorTable):
     position: Vector[Length]
     """(d,) Position of the point [m]."""
     radius: Reach = None
-    """Radius within which particles contribute [m]; the support radius if left out."""
+    """Radius around the point [m]; the support radius of the smoothing kernel if left out."""
     on: Text | None = None
-    """Name of a moving solid that carries the point along, from its position at the start of the scene."""
+    """Name of a moving solid that carries the point along."""
 
 
 class WaveGaugeTable(SensorTable):
-    """A sensor of the height of the fluid's surface: the level to which the fluid in a vertical column would fill the
-    space that solids leave free."""
+    """A sensor of the height of the free surface in a vertical column."""
 
     kind: Literal["wave_gauge"]
     """Kind of the sensor."""
     position: Vector[Length]
     """(d,) A point on the axis of the column [m]; its height has no effect."""
     floor: Length = 0.0
-    """Height at which the column begins [m], measured against gravity; usually the bottom of the container."""
+    """Height of the column's lower end [m], measured upwards against gravity; usually the height of the container's
+    bottom."""
     radius: Reach = None
-    """Radius of the column [m]; two support radii, but at least five spacings, if left out."""
+    """Radius of the column [m]. If left out, two support radii, but at least five spacings."""
     on: Text | None = None
-    """Name of a moving solid that carries the column along, from its position at the start of the scene."""
+    """Name of a moving solid that carries the column along."""
     axes: Axes = "world"
-    """Axes of a column carried by a solid. "body": the column turns with the solid, and heights are heights in the
-    solid at the start. "world": the column stays upright, and heights are heights in the scene."""
+    """Axes of a column that a solid carries. With "body", the column rotates with the solid, and heights are measured
+    along the solid's axes. With "world", the column stays upright, and heights are measured in the scene."""
 
 
 class FlowRateTable(SensorTable):
@@ -74,10 +73,10 @@ class FlowRateTable(SensorTable):
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
     normal: Vector[Annotated[float, quantity()]]
-    """(d,) Direction in which the flow counts as positive."""
+    """(d,) Direction of positive flow."""
     reach: Reach = None
-    """Half the thickness of the measured layer of fluid [m]; two support radii, but at least five spacings, if left
-    out."""
+    """Half the thickness of the measured layer of fluid [m]. If left out, two support radii, but at least five
+    spacings."""
 
     @field_validator("normal")
     @classmethod
@@ -88,7 +87,7 @@ class FlowRateTable(SensorTable):
 
 
 class WallForceTable(SensorTable):
-    """A sensor of the force, and its torque, that the fluid in a region exerts on the walls."""
+    """A sensor of the force and torque of the fluid on walls in a region."""
 
     kind: Literal["wall_force"]
     """Kind of the sensor."""
@@ -99,9 +98,9 @@ class WallForceTable(SensorTable):
     about: Corner = None
     """(d,) Reference point of the torque [m]; the origin if left out."""
     on: Text | None = None
-    """Name of a moving solid that carries and turns the region and the reference point from their initial positions."""
+    """Name of a moving solid that carries the region and the reference point along."""
     axes: Axes = "world"
-    """Axes of force and torque for a region on a solid: "world", or "body" for axes that turn with the solid."""
+    """Axes of force and torque: "world", or "body" for axes that rotate with the solid named by `on`."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -111,18 +110,18 @@ class WallForceTable(SensorTable):
 
 
 class SolidLoadTable(SensorTable):
-    """A sensor of the fluid's force on a solid, and of its torque about the solid's middle."""
+    """A sensor of the force and torque of the fluid on a solid. The torque is about the solid's middle."""
 
     kind: Literal["solid_load"]
     """Kind of the sensor."""
     solid: Text
     """Name of the solid."""
     axes: Axes = "world"
-    """Axes of force and torque: "world", or "body" for axes that turn with the solid."""
+    """Axes of force and torque: "world", or "body" for axes that rotate with the solid."""
 
 
 class SpringForceTable(SensorTable):
-    """A sensor of the force with which a spring pulls, and of the spring's length."""
+    """A sensor of the tension and the length of a spring."""
 
     kind: Literal["spring_force"]
     """Kind of the sensor."""
@@ -131,12 +130,12 @@ class SpringForceTable(SensorTable):
 
 
 class BodyMotionTable(SensorTable):
-    """A sensor of a free body's position, rotation, velocity and angular velocity."""
+    """A sensor of the position, rotation, velocity and angular velocity of a free body."""
 
     kind: Literal["body_motion"]
     """Kind of the sensor."""
     solid: Text
-    """Name of the body."""
+    """Name of the free body."""
 
 
 AnySensor = Annotated[

@@ -1,4 +1,4 @@
-"""Tables of shapes that solids and bodies of fluid share, and tables of containers with their walls."""
+"""Tables of shapes for solids and bodies of fluid, and tables of containers."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,17 +23,16 @@ from cortado.scene.tables import Colour, FieldPath, Flag, Length, OneOf, Table, 
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 THIN = 2.5
-"""Thickness of parts of meshes that do not count as sheets [spacings]."""
+"""Greatest thickness of a part of a mesh that counts as a sheet [spacings]."""
 
 
 def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
-    """Check that each component of ``upper`` is greater than that of ``lower``."""
+    """Check that each component of ``lower`` is less than the component of ``upper`` along the same axis."""
     if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
         raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
 def _beside_scene(file: str, info: ValidationInfo) -> str:
-    """Return the absolute path of a file; relative paths start at the scene file's folder."""
     folder = Path((info.context or {}).get("folder", "."))
     try:
         return str((folder / file).absolute())
@@ -49,9 +48,9 @@ class BoxShape(Table):
 
     shape: Literal["box"] = "box"
     lower: Vector[Length]
-    """(d,) Corner with the least coordinates [m], before a rotation if the table has one."""
+    """(d,) Corner with the smallest coordinates [m], before a rotation."""
     upper: Vector[Length]
-    """(d,) Corner with the greatest coordinates [m]."""
+    """(d,) Corner with the greatest coordinates [m], before a rotation."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -79,7 +78,7 @@ class CylinderShape(Table):
     """A cylinder, in 3-D."""
 
     instead: ClassVar[str]
-    """Names of corresponding shapes in 2-D."""
+    """Names of the shapes to use in 2-D."""
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
     """(3,) Centre of the bottom [m]."""
@@ -88,7 +87,7 @@ class CylinderShape(Table):
     height: Annotated[float, quantity("m", gt=0.0)]
     """Length along the axis, from the base [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """Axis of space along which the cylinder stands, before a rotation if the table has one."""
+    """Axis of space along which the cylinder stands, before a rotation."""
 
     @property
     def along(self) -> int:
@@ -141,7 +140,7 @@ class MeshShape(Table):
     file: File
     """Name of an STL, OBJ, PLY, glTF or GLB file. A relative path starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor by which lengths are multiplied, such as 0.001 for millimetres."""
+    """Factor of all lengths in the file, such as 0.001 for millimetres."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if dimension == 2:
@@ -152,7 +151,7 @@ class MeshShape(Table):
         return _about_middle(mesh_in_file(self.file), self.scale)
 
     def thinnest_sheet(self, spacing: float) -> float:
-        """Return the thickness of the thinnest sheet [m]; infinite if all are thicker than `THIN` spacings [m]."""
+        """Return the thickness of the thinnest sheet in the mesh [m]; infinite without sheets."""
         return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
 
 
@@ -168,13 +167,13 @@ def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
 
 
 def surface_cells(lower: Points, upper: Points, spacing: float) -> float:
-    """Return the number of cells with this spacing [m] on the surface of a box with corners (d,) [m]."""
+    """Return the number of cells of width ``spacing`` [m] on the surface of a box with corners (d,) [m]."""
     cells = np.maximum((upper - lower) / spacing, 1.0)
     return float(2.0 * np.sum(np.prod(cells) / cells))
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:
-    """Return the indices of two sides of a polygon that cross or overlap, or twice that of a side without length."""
+    """Return the indices of two crossing sides of a polygon, or None. A side of length 0 is returned twice."""
     count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
 
     def turned(a: Points, b: Points) -> float:
@@ -197,39 +196,43 @@ def _crossing(corners: Points) -> tuple[int, int] | None:
 
 
 class Container(Table):
-    """A container of the fluid, of any shape; without other methods it is free space."""
+    """A container of the fluid. The base class is free space."""
 
     sticks: ClassVar[Any] = False
     finish: ClassVar[Any] = None
-    """`Finish` of the walls; None without a material or colour."""
+    """Appearance of the walls in pictures; None for the default appearance."""
 
     def extent(self) -> tuple[Points, Points] | None:
-        """Return the lower and the upper corner (d,) [m] of the box around the container; None without a container."""
+        """Return the lower and the upper corner (d,) [m] of the container's bounding box. Return None for free
+        space."""
         return None
 
     def region(self, dimension: int) -> Region:
-        """Return the region for fluid, within one period."""
+        """Return the region for fluid inside the container."""
         return Region.everywhere(dimension)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Return a mask (n,) of the points (n, d) [m] that are at most ``tolerance`` [m] outside."""
+        """Test for each of ``points`` (n, d) [m] if it is in the container, with a ``tolerance`` [m]."""
         return self.region(points.shape[1]).contains(points, tolerance)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
-        """Return one layer (b, d) of wall particles [m], ``depth`` [m] outside of the container."""
+        """Return the positions (b, d) [m] of a layer of wall particles, ``depth`` [m] outside the container."""
         return np.zeros((0, dimension))
 
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        """Return places for fluid less than ``reach`` [m] from a wall."""
+        """Return places for fluid that are less than ``reach`` [m] from a wall."""
         return Places.upright(np.zeros((0, dimension)))
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """Return a shorter container with equal weights of walls, for a spacing and a support [m]. Also return a
-        function from points (b, d) [m] on these walls to points of equal weight on the shorter walls."""
+        """Return a shorter container with the same weights of wall particles. ``spacing`` and ``support`` are in
+        metres.
+
+        Also return a function that maps points (b, d) [m] on the walls of the container to the shorter container.
+        """
         return self, lambda points: points
 
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        """Return the solids that form the container's walls, extended by ``reach`` [m] beyond the ends of a period."""
+        """Return the solids that form the walls of the container. ``reach`` [m] extends the solids at periodic ends."""
         return ()
 
     def wall_count(self, spacing: float) -> float:
@@ -237,12 +240,13 @@ class Container(Table):
         return 0.0 if ends is None else surface_cells(*ends, spacing)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Return the start and the length of the period, each (d,) [m]; the length is 0 along other axes."""
+        """Return the lower corner and the lengths of the periodic box, each (d,) [m]. The length is 0 along an axis
+        that is not periodic."""
         return np.zeros(dimension), np.zeros(dimension)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return the coordinates of flat walls that mirror the fluid, for a support [m]: at the lower and the upper end
-        of each axis, each (d,) [m]; -inf or inf without a mirroring wall."""
+        """Return the coordinates of the flat walls that mirror the fluid: lower walls (d,) and upper walls (d,) [m]. A
+        coordinate is infinite if no wall mirrors. ``support`` is the support radius [m]."""
         return np.full(dimension, -np.inf), np.full(dimension, np.inf)
 
     def domain(self, dimension: int) -> Domain:
@@ -256,15 +260,15 @@ class NoContainer(Container):
 
 
 class Walled(Table):
-    """Keys of a container's walls."""
+    """Keys for the walls of a container."""
 
     slip: Literal["free", "no"] = "free"
-    """"no": the viscous force acts between fluid and wall; "free": it does not."""
+    """"no" for no-slip walls; "free" for walls without viscous force."""
     material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
-    """Look of the walls in pictures; clear glass if left out."""
+    """Material of the walls in pictures; clear glass if left out."""
     colour: Colour | None = None
-    """(3,) Colour of the walls in pictures: red, green and blue, each from 0 to 1, in linear light. With a colour but
-    without a material the walls are opaque."""
+    """(3,) Colour of the walls in pictures: red, green and blue from 0 to 1, in linear light. Walls with a colour but
+    without a material are opaque."""
 
     @property
     def sticks(self) -> bool:
@@ -279,10 +283,11 @@ class Walled(Table):
 
 
 class BoxContainer(Walled, BoxShape, Container):
-    """A container in the shape of a box, closed on all sides except along its periodic axes."""
+    """A box-shaped container. It is closed on all sides except along periodic axes."""
 
     periodic: Vector[Flag] = (False, False, False)
-    """(d,) Whether each axis is periodic: fluid that leaves on one side comes in on the other."""
+    """(d,) Whether each axis is periodic. Fluid that leaves through one side of a periodic axis enters through the
+    opposite side."""
 
     def extent(self) -> tuple[Points, Points]:
         return np.array(self.lower), np.array(self.upper)
@@ -308,8 +313,8 @@ class BoxContainer(Walled, BoxShape, Container):
         return box_places(*self.extent(), self.periodic, spacing, reach)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return the walls that mirror the fluid: not walls without slip, where mirrored fluid would distort the shear,
-        nor walls of a very narrow box, where images would have images."""
+        """Return the coordinates of the flat walls that mirror the fluid: lower walls (d,) and upper walls (d,) [m].
+        No-slip walls and walls of a very narrow box do not mirror."""
         (lower, upper), periodic = self.extent(), np.array(self.periodic)
         if self.sticks or (upper - lower < support)[~periodic].any():
             return super().mirrors(dimension, support)
@@ -321,11 +326,11 @@ class BoxContainer(Walled, BoxShape, Container):
 
 
 class CylinderContainer(Walled, CylinderShape, Container):
-    """A container in the shape of a cup, in 3-D."""
+    """A cylindrical container, with or without a lid, in 3-D."""
 
     instead: ClassVar = '"box" or "none"'
     lid: Flag = True
-    """Whether the cup is closed at the top; without a lid, fluid may rise above the rim."""
+    """Whether the cylinder is closed at the top. Without a lid, fluid may rise above the rim."""
 
     def extent(self) -> tuple[Points, Points]:
         axis = self.along
@@ -360,8 +365,7 @@ AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(d
 
 
 def check_length(container: Container, spacing: float, support_radius: float) -> None:
-    """Check that a container is at least one spacing wide, and a period longer than two support radii, as the neighbour
-    search considers only the nearest periodic image."""
+    """Check that a container is at least one spacing wide, and that a periodic box is longer than two support radii."""
     ends = container.extent()
     if ends is None:
         return

@@ -21,8 +21,7 @@ ALONG = 1e-9
 
 
 class PlaneSolid(SolidTable):
-    """The half space behind a plane, such as a slope or a wall, at rest; `normal` points from it into the fluid. A
-    plane needs a container, which cuts it."""
+    """The half space behind a plane at rest, such as a slope or a wall. A scene with a plane needs a container."""
 
     shape: Literal["plane"] = "plane"
     position: Vector[Length]
@@ -92,16 +91,16 @@ class SphereSolid(SphereShape, SolidTable):
 
 
 class CapsuleSolid(SolidTable):
-    """A solid capsule: all points within a radius of a line segment."""
+    """A solid capsule: a cylinder with two hemispheres as ends."""
 
     measures: ClassVar = ("start", "end", "radius")
     shape: Literal["capsule"] = "capsule"
     start: Vector[Length]
-    """(d,) One end of the segment [m]."""
+    """(d,) Start of the capsule's axis [m]."""
     end: Vector[Length]
-    """(d,) Other end of the segment [m]."""
+    """(d,) End of the capsule's axis [m]."""
     radius: Size
-    """Distance from the segment to the surface [m]."""
+    """Distance from the axis to the surface [m]."""
 
     def shape_about(self) -> tuple[Solid, Points]:
         start, end = np.array(self.start), np.array(self.end)
@@ -127,7 +126,7 @@ class CupSolid(SolidTable):
     measures: ClassVar = ("base", "radius", "height", "thickness")
     shape: Literal["cup"] = "cup"
     base: Vector[Length]
-    """(d,) Centre of the bottom's outer side [m]."""
+    """(d,) Centre of the outer side of the bottom [m]."""
     radius: Size
     """Inner radius: distance from the axis to the inner side [m]."""
     height: Size
@@ -135,7 +134,7 @@ class CupSolid(SolidTable):
     thickness: Size
     """Thickness of the side and the bottom [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """Axis of space along which the cup stands, before any rotation; in 2-D it stands along y."""
+    """Axis of space along which the cup stands, before a rotation. In 2-D the cup stands along y."""
 
     @model_validator(mode="after")
     def _check_height(self) -> Self:
@@ -160,7 +159,6 @@ class CupSolid(SolidTable):
         return self.thickness
 
     def _middle(self) -> float:
-        """Return the height of the centroid above the base [m]."""
         power = len(self.base) - 1
         solid, hollow = (self.radius + self.thickness) ** power, self.radius**power
         whole, cavity = solid * self.height, hollow * (self.height - self.thickness)
@@ -189,12 +187,12 @@ class MeshSolid(MeshShape, SolidTable):
 
 
 FLAT = 1e-6
-"""Largest distance of a flat sheet's corners from a common plane, relative to the size of the sheet."""
+"""Greatest distance of a flat sheet's corners from a plane, relative to the size of the sheet."""
 
 
 class SheetSolid(SolidTable):
-    """A wall of no thickness that separates the fluids on its two sides. In 2-D it is a line of straight parts, in 3-D
-    a flat convex polygon or the open mesh of a file."""
+    """A wall without thickness that separates the fluids on its two sides. In 2-D it is a line of straight parts. In
+    3-D it is a flat convex polygon, or the open mesh of a file."""
 
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.0
@@ -203,12 +201,13 @@ class SheetSolid(SolidTable):
     corners: Annotated[
         tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=3)], ...] | None, Field(min_length=2)
     ] = None
-    """(m, d) Corners, in order [m]: in 2-D along the sheet, where the last may equal the first; in 3-D around it."""
+    """(m, d) Corners in order [m]. In 2-D the corners follow the line, and the last corner may equal the first. In 3-D
+    the corners go around the polygon."""
     file: File | None = None
-    """In 3-D, the file of a mesh, in place of corners: STL, OBJ, PLY, glTF or GLB. The mesh may be open. A relative
-    path starts at the scene file's folder."""
+    """File of a mesh in 3-D, in place of `corners`: STL, OBJ, PLY, glTF or GLB. The mesh may be open. A relative path
+    starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor by which lengths are multiplied, such as 0.001 for millimetres."""
+    """Factor of all lengths in the file, such as 0.001 for millimetres."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         turned = super().in_dimension(dimension, path)
@@ -266,7 +265,6 @@ class SheetSolid(SolidTable):
 
 @cached_by_file(8, MOST_BYTES)
 def _sheet_in(path: str) -> Sheet:
-    """Read the surface in a file of triangles, in the file's unit of length; raise `InputError`."""
     vertices, corners = triangles_in_file(path)
     places, numbers = np.unique(vertices, axis=0, return_inverse=True)
     found = Sheet(places, numbers.reshape(-1)[corners])

@@ -1,4 +1,4 @@
-"""The table [solver] of a scene: the algorithm of a step, with its keys."""
+"""The table [solver] of a scene: the algorithm of a step and its keys."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, get_args
@@ -11,26 +11,26 @@ from cortado.scene.packages import Inline, PackageTable
 from cortado.scene.tables import Flag, OrWord, Table, Text, count, field_error, quantity
 
 OWN = ("projection", "pcisph")
-"""Kinds of Cortado's solvers; the first is the default."""
+"""Cortado's kinds of solvers. The first is the default."""
 COURANT = 0.2
-"""Default Courant number; with 0.3 and more PCISPH diverges in some scenes."""
+"""Default Courant number."""
 
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]
-"""Names of tables, each with keys and values that belong together."""
+"""Names of tables with default values for their keys."""
 
 
 class SolverTable(Table):
-    """Algorithm and length of a step."""
+    """Algorithm and time step."""
 
     kind: str
     """Name of the algorithm."""
     time_step: Annotated[float | Literal["auto"], OrWord(quantity("s", gt=0.0), "auto")]
     """Length of a step [s]; "auto" chooses the length of each step before it."""
     courant: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
-    """Courant number of adaptive time steps: the largest distance that the fastest particle moves in a step, in
-    smoothing lengths (half a support radius); 0.2 if left out."""
+    """Courant number of adaptive time steps; 0.2 if left out. The fastest particle moves at most this number of
+    smoothing lengths in a time step. A smoothing length is half a support radius."""
     greatest_time_step: Annotated[float, quantity("s", gt=0.0)] | None = None
-    """Upper bound of adaptive time steps [s]; needed if nothing else bounds them, as without gravity."""
+    """Greatest adaptive time step [s]. Scenes without gravity may need this key."""
 
     @model_validator(mode="before")
     @classmethod
@@ -51,41 +51,41 @@ class SolverTable(Table):
 
     @property
     def chooses(self) -> bool:
-        """Return True if the length of each step is chosen before it."""
+        """True if time steps are adaptive."""
         return self.time_step == "auto"
 
     def fixed_time_step(self, what: str) -> float:
-        """Return the fixed length of a step [s], which ``what`` needs; raise `InputError` if steps are adaptive."""
+        """Return the fixed time step [s]. Raise `InputError` if time steps are adaptive; the message names ``what`` as
+        the reason."""
         if self.time_step == "auto":
             raise InputError(f'solver.time_step is "auto", but must be a number of seconds for {what}.')
         return self.time_step
 
 
 class ProjectionSolver(SolverTable):
-    """A solver that projects velocities to zero divergence; its pressure may be negative inside the fluid."""
+    """A solver that projects velocities to zero divergence. Its pressure may be negative inside the fluid."""
 
     kind: Literal["projection"] = "projection"
     """Name of the algorithm."""
     iterations: Annotated[int, count(2, 1_000)] = 2
-    """Number of pressure iterations in every step, each starting from the last pressure; with a tolerance the
-    minimum."""
+    """Number of pressure iterations in every step, or the minimum if `tolerance` is given."""
     tolerance: Annotated[float, quantity(gt=0.0)] | None = None
-    """Iterations end once the divergence is below this value, measured as the root mean square inside the fluid of the
-    divergence times the time step. If left out, every step has the same number of iterations."""
+    """Tolerance of the pressure iterations: root mean square of divergence times time step, inside the fluid. If left
+    out, every step has the same number of iterations."""
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
-    """Largest number of pressure iterations in a step, with a tolerance."""
+    """Greatest number of pressure iterations in a step if `tolerance` is given."""
     repairs: Annotated[int, count(1, 1_000)] = 2
-    """Number of iterations in every step that move particles back to the rest density."""
+    """Number of density iterations in every step. They move particles until the fluid has its rest density."""
     velocities_follow: Flag = False
-    """If true, velocities are corrected when the shift and the repairs move a particle by delta: v + (delta · grad) v.
-    Flows in full containers then lose less speed, but flows with a surface can gain energy."""
+    """If true, velocities are corrected when a step shifts particles without their velocity. Flows in full containers
+    then lose less speed, but flows with a free surface can gain energy."""
     suits: ClassVar[Suits] = (
         ("discretisation", {"kernel": "wendland_c2", "support": 2.6}),
         ("emitter", {"jitter": 0.05}),
     )
-    """Values for other tables that set none of these keys; `docs/projection.md` has the measurements."""
+    """Default values of keys in other tables; see `docs/projection.md`."""
     suits_without_surface: ClassVar[Suits] = (("discretisation", {"jitter": 0.05}),)
-    """Values for other tables if all axes are periodic, where no surface disturbs the order of a lattice."""
+    """Default values of keys in other tables if all axes are periodic."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:
@@ -98,7 +98,7 @@ class ProjectionSolver(SolverTable):
 
 
 class PcisphSolver(SolverTable):
-    """A solver by PCISPH, predictive-corrective incompressible SPH."""
+    """The solver PCISPH: predictive-corrective incompressible SPH."""
 
     kind: Literal["pcisph"]
     """Name of the algorithm."""
@@ -107,11 +107,10 @@ class PcisphSolver(SolverTable):
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
     """Maximum number of pressure iterations in a step."""
     density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
-    """Iterations end once the average error of the density is below this value. The error of a particle is
-    (rho - rho_0) / rho_0, or 0 where that is negative."""
+    """Tolerance of the average density error of all particles. The error of a particle is (density - rest density) /
+    rest density, or 0 if this is negative."""
     maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
-    """Iterations end only once the maximum of (rho - rho_0) / rho_0 is below this value, too; no condition if left
-    out."""
+    """Tolerance of the greatest density error of a particle; no limit if left out."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:
@@ -122,7 +121,7 @@ class PcisphSolver(SolverTable):
 
 
 class PackageSolver(SolverTable, PackageTable):
-    """A solver that an installed package registers."""
+    """A solver from an installed package."""
 
     group = "cortado.solvers"
     method = "build"
@@ -133,8 +132,8 @@ class PackageSolver(SolverTable, PackageTable):
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """Return keys that suit a solver, given as a table or its contents, for other tables that set none of these
-    keys."""
+    """Return the default values that a solver sets in other tables. ``solver`` and ``container`` are tables or
+    dicts."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
     periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)

@@ -1,4 +1,4 @@
-"""Estimates of the largest stable time step of a scene."""
+"""Estimates of the greatest stable time step of a scene."""
 
 from collections.abc import Sequence
 from math import inf, sqrt
@@ -18,18 +18,18 @@ from cortado.scene.solvers import ProjectionSolver
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
-    """Return the greatest energy per mass [J/kg] of fluid that falls through the room, with gravity (k, d) [m/s2]."""
+    """Return the greatest energy per mass [J/kg] that fluid can gain by a fall inside the container, for gravity (k, d)
+    [m/s2]."""
     lower, upper = _extent(scene)
     return float((np.abs(gravity) @ (upper - lower)).max())
 
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
-    """Return the greatest energy per mass [J/kg] of fluid that falls to the lowest point of a solid, with gravity (k,
-    d) [m/s2] and ``values`` of parameters that replace the scene's.
+    """Return the greatest energy per mass [J/kg] of fluid that falls to the lowest point of a solid, for gravity (k, d)
+    [m/s2]. Parameters in ``values`` replace the scene's.
 
-    The fall begins at the highest point of initial fluid, free bodies and outlets. The result is `greatest_fall` if
-    something else can raise fluid or lower the solid: gravity that changes or acts along a period, or solids that are
-    free, follow paths, convey, or start elsewhere. Rows of ``values`` for the steps of a path are ignored.
+    The fall begins at the highest point of initial fluid, free bodies and emitters. If gravity changes or the solid
+    moves, the result is `greatest_fall`.
     """
     whole = greatest_fall(scene, gravity)
     around = scene.periods[1] > 0.0
@@ -44,7 +44,6 @@ def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arra
 
 
 def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
-    """Return a box around each body of fluid, each free body and each outlet: lower and upper corner, each (d,) [m]."""
     spacing = scene.discretisation.spacing
     places = values.get("initial_positions")
     extents = [fluid.extent(spacing) for fluid in scene.fluid]
@@ -63,8 +62,6 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 def _room(scene: SceneTables) -> tuple[Points, Points]:
-    """Return the corners, each (d,) [m], of the container's box, or else of the box around fluids, solids or
-    outlets."""
     ends = scene.container.extent()
     if ends is not None:
         return ends
@@ -79,33 +76,34 @@ def _room(scene: SceneTables) -> tuple[Points, Points]:
 
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
-"""Function for the greatest rate on a lattice, and fraction of a lattice's longest step for fluid off the lattice and
-beside walls, by the form of the viscous force."""
+"""Function for the greatest viscous rate on a lattice, and safety factor of the time step, for each form of the viscous
+force."""
 
 
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
-"""C by the kernel in the limit C s^(3/2) / (H sqrt(g)) for resting fluid of depth H, with a support of 2 spacings s."""
+"""Factors of the time step limit for deep fluid, by smoothing kernel."""
 
 
 RESTING, RUNNING = 0.63, 0.4
-"""C in the limit C s / sqrt(H |g|) for fluid of depth H with a coarse grid. RESTING is for fluid that covers the floor
-of its container, RUNNING for fluid with room to run out, such as a dam."""
+"""Factors of the time step limit for deep fluid with a coarse pressure grid. The first factor is for fluid that covers
+the floor of its container."""
 
 
 SOLID_STEP = 0.2
-"""Largest motion of a solid in a step [spacings]."""
+"""Greatest motion of a solid in a time step [spacings]."""
 FRICTION_STEP = 0.25
-"""nu dt / s² up to which free bodies without slip move correctly, within 2 % for a disc that settles between walls."""
+"""Greatest kinematic viscosity times time step beside no-slip free bodies [spacings²]."""
 
 BESIDE, THROUGH = 0.4, 0.25
-"""Largest motion of fluid in a step beside a solid, in spacings and as a fraction of the solid's thickness."""
+"""Greatest motion of fluid beside a solid in a time step: in spacings, and as a fraction of the solid's thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return by name the bounds [s] of adaptive time steps that hold at any speed of the fluid: `standing_limits` and
-    the key ``greatest_time_step``. Gravity in ``values`` and paths of solids bound each step separately
-    (`gravity_limits`), so the scene's gravity is used, or the weakest of a schedule. If nothing else bounds the steps,
-    the strongest gravity and the fastest part of a path bound all steps."""
+    """Return upper bounds of adaptive time steps [s] by name. They do not depend on the speed of the fluid.
+
+    The bounds are `standing_limits` and the key ``greatest_time_step``. If gravity changes, `gravity_limits` bounds
+    each time step separately.
+    """
     own = {name: value for name, value in (values or {}).items() if name != "gravity"}
     found = standing_limits(scene, own, [solid for solid in scene.solid if solid.is_steady])
     if scene.schedule.leads_gravity:
@@ -122,13 +120,13 @@ def longest_step(scene: SceneTables) -> float:
 
 
 def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[tuple[str, float]]:
-    """Return the names and values [s] of the `stability_limits` that a time step exceeds, smallest first."""
+    """Return the names and values [s] of the stability limits that ``time_step`` exceeds, smallest first."""
     limits = sorted(stability_limits(scene, values).items(), key=lambda item: item[1])
     return [(name, limit) for name, limit in limits if time_step > limit * (1.0 + 1e-9)]
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """Return advice for a run that diverged with a time step [s]; ``values`` of parameters replace the scene's."""
+    """Return advice for a run that diverged with this time step [s]. Parameters in ``values`` replace the scene's."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limits(scene, values, time_step)
@@ -139,33 +137,29 @@ def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> s
 
 
 def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return the stability limits of the time step [s] by name, infinite without a limit; h is the support radius.
+    """Return the stability limits of the time step [s] by name. A limit is infinite if it does not apply. In the
+    formulas h is the support radius, s the spacing and g gravity.
 
-    Courant: 0.4 h / v, where v is the larger of the initial speed and that of a free fall through the container;
-    without a container, through the extent of fluid and solids (Monaghan 1992). An emitter counts with its speed, and
-    its fluid falls from the outlet.
+    Courant: 0.4 h / v (Monaghan 1992). The speed v is the larger of the initial speed and the speed after a free fall
+    through the container. Emitters count as well.
 
-    Solids: beside a solid, fluid moves at most 0.4 spacings in a step, and at most a quarter of the solid's thickness.
-    The fluid's speed is the initial speed plus that of the fall in `fall_to`.
+    Solids: beside a solid, fluid moves at most 0.4 spacings in a time step, and at most a quarter of the solid's
+    thickness.
 
-    Force: 0.25 sqrt(h / |g|) (Monaghan 1992). Viscosity: a fraction of 2 rho / (mu l), the longest stable explicit step
-    on a lattice, where l is the greatest rate of the viscous force's form, see `VISCOUS_RATES`. mu is that of the most
-    viscous and rho that of the lightest phase in use, as they may meet. For the pairwise form with the cubic spline it
-    is about 0.023 h^2 rho / mu.
+    Force: 0.25 sqrt(h / |g|) (Monaghan 1992).
 
-    Depth: C s^(3/2) / (H sqrt(|g|)) for fluid of depth H and the spacing s, see `DEPTH_FACTORS`; the limit is
-    proportional to the support. With a coarse grid it is C s / sqrt(H |g|), see `RESTING`. In a container that leans, H
-    is the depth in the lowest corner once the surface is level: the height of the fluid and half its width, each along
-    gravity.
+    Viscosity: a fraction of the longest stable explicit time step on a lattice; see `VISCOUS_RATES`. It uses the
+    greatest viscosity and the smallest density of the phases.
 
-    Friction: 0.25 s^2 / nu if free bodies have no slip, with the greatest viscosity over the smallest density as nu.
-    Longer steps make free bodies too fast, because pressure and friction act one after the other.
+    Depth: C s^(3/2) / (H sqrt(|g|)) for fluid of depth H, where the factor C is from `DEPTH_FACTORS`. With a coarse
+    grid it is C s / sqrt(H |g|), where C is `RESTING` or `RUNNING`. In a tilted container, H is the depth in the lowest
+    corner.
 
-    Moving solids move at most a fifth of a spacing in a step, and fluid near a sink at most 0.4 spacings. Optional
-    forces have limits in the registry of parameters.
+    Friction: 0.25 s^2 / nu for no-slip free bodies in fluid of kinematic viscosity nu.
 
-    ``values``: parameters by name that replace the scene's and its schedule's; of a changing gravity the strongest is
-    used.
+    Moving solids move at most a fifth of a spacing in a time step, and fluid near a sink moves at most 0.4 spacings.
+    Optional forces have limits in the registry of parameters. Parameters in ``values`` replace the scene's parameters
+    and schedule. If gravity changes, its strongest value is used.
     """
     values = values or {}
     gravity, first = np.atleast_2d(values.get("gravity", _gravity(scene))), _first_speed(scene, values)
@@ -176,7 +170,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
 
 def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
-    """Return the `stability_limits` [s] that do not depend on the fluid's speed, with these moving solids."""
+    """Return the stability limits [s] that do not depend on the speed of the fluid. ``solids`` are the moving
+    solids."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
@@ -191,7 +186,7 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
 
 
 def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
-    """Return the `stability_limits` (k,) [s] that follow from gravity (k, d) [m/s2], one for each row."""
+    """Return the stability limits (k,) [s] that depend on gravity (k, d) [m/s2]."""
     strength = np.linalg.norm(gravity, axis=1)
     with np.errstate(divide="ignore"):
         force = 0.25 * np.sqrt(scene.discretisation.support_radius / strength)
@@ -210,7 +205,7 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """Test whether the viscous force is computed implicitly; ``values`` of parameters replace the scene's."""
+    """Test if the viscous force is computed implicitly. Parameters in ``values`` replace the scene's."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False
@@ -222,7 +217,6 @@ def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
 
 
 def _gravity(scene: SceneTables) -> Points:
-    """Return the scene's gravity (d,) [m/s2], or (k, d) at the times of a schedule that changes gravity."""
     courses = scene.schedule.courses
     if "tilt" in courses:
         return Tilt(scene.forces.gravity).gravity(courses["tilt"].seen)
@@ -230,7 +224,6 @@ def _gravity(scene: SceneTables) -> Points:
 
 
 def _first_speed(scene: SceneTables, values: Arrays) -> float:
-    """Return the greatest speed of fluid at the start and at outlets of emitters [m/s]."""
     if "initial_velocities" in values:
         speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
     else:
@@ -253,8 +246,7 @@ def viscous_limit(scene: SceneTables, values: Arrays) -> float:
 
 
 def _kinematic(scene: SceneTables, values: Arrays) -> float:
-    """Return the greatest kinematic viscosity [m2/s]: the viscosity of the most viscous phase over the density of the
-    lightest, as they may meet; 0 without viscosity."""
+    """Return the greatest viscosity of the phases divided by their smallest density [m2/s]; 0 without viscosity."""
     if scene.forces.viscosity == "none":
         return 0.0
     names = {body.phase for body in (*scene.fluid, *scene.emitter)}
@@ -267,7 +259,7 @@ def _kinematic(scene: SceneTables, values: Arrays) -> float:
 
 
 def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Arrays) -> float:
-    """Return the longest step [s] for fluid with an initial speed ``first`` [m/s] beside solids; may be infinite."""
+    """Return the longest time step [s] for fluid beside solids, with the initial speed ``first`` [m/s]."""
     spacing, found = scene.discretisation.spacing, [inf]
     for solid in scene.solid:
         speed = first + sqrt(2.0 * fall_to(scene, solid, gravity, values))
@@ -277,7 +269,7 @@ def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Ar
 
 
 def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
-    """Return the limits (k,) [s] from the depth of the fluid for gravity (k, d) [m/s2], infinite if gravity is 0."""
+    """Return the time step limits (k,) [s] from the depth of the fluid, for gravity (k, d) [m/s2]."""
     limits = np.full(len(gravity), inf)
     acts = gravity.any(axis=1)
     if not scene.forces.pressure or not acts.any() or not scene.fluid:
@@ -297,7 +289,7 @@ def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
 
 
 def _covers_floor(scene: SceneTables, upright: Points) -> Points:
-    """Return a mask (k,): True if the fluid is as wide as the container along all axes but ``upright`` (k,)."""
+    """Test if the fluid covers the floor of the container, for each vertical axis in ``upright`` (k,)."""
     ends = scene.container.extent()
     if ends is None:
         return np.zeros(len(upright), dtype=bool)
@@ -306,14 +298,13 @@ def _covers_floor(scene: SceneTables, upright: Points) -> Points:
 
 
 def fluid_lengths(scene: SceneTables) -> Points:
-    """Return the lengths (d,) [m] of the initial fluid along each axis, without the gaps between bodies."""
+    """Return the length of the initial fluid along each axis (d,) [m], without empty gaps."""
     spacing = scene.discretisation.spacing
     extents = np.array([fluid.extent(spacing) for fluid in scene.fluid])
     return np.array([_covered(extents[:, :, axis], spacing) for axis in range(scene.dimension)])
 
 
 def _covered(ends: Points, spacing: float) -> float:
-    """Return the total length [m] of the union of intervals (m, 2) [m] along an axis."""
     total, reached = 0.0, -inf
     for lower, upper in ends[np.argsort(ends[:, 0])]:
         lower, upper = lower - 0.5 * spacing, upper + 0.5 * spacing

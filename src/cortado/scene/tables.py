@@ -1,9 +1,8 @@
-"""Base class of the tables of a scene, types of their fields for pydantic, and the sentences of errors.
+"""Base class of the tables of a scene, types of their fields for pydantic, and error messages.
 
-A field is ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks the value of a field, and describes the
-field in the JSON schema of its table. Error sentences come from this schema. A wrong value raises a `SceneError`. The
-docstrings below fields become descriptions in schemas. Python reads these docstrings from the source only when a schema
-is requested, because that takes a third of a second.
+A field is written as ``Annotated[float, quantity("kg/m3", gt=0.0)]``. Pydantic checks the value and describes the field
+in the JSON schema of its table. Error messages are made from the JSON schema. Docstrings below fields become
+descriptions in the schema.
 """
 
 import ast
@@ -41,7 +40,7 @@ FieldPath = Sequence[str | int]
 
 @dataclass(frozen=True, repr=False)
 class FieldError:
-    """An error in a field; ``repr`` hides the value found, which may be of any length, from pydantic's messages."""
+    """An error in a field. Its ``repr`` hides the invalid value, which may be long."""
 
     path: tuple[str | int, ...]
     found: Any
@@ -50,18 +49,18 @@ class FieldError:
 
 
 def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None = None) -> PydanticCustomError:
-    """Build the exception that a check raises; ``path`` starts at the model under check."""
+    """Make the exception for a failed check. ``path`` is relative to the checked table."""
     return PydanticCustomError("scene", "wrong value", {"error": FieldError(tuple(path), found, wanted, sentence)})
 
 
 def check_name(path: FieldPath, name: str | None, names: Sequence[str], kind: str, otherwise: str = "") -> None:
-    """Raise a `field_error` if a name is not in ``names``; ``otherwise`` is the advice if ``names`` is empty."""
+    """Raise a `field_error` if a name is not in ``names``. The error says ``otherwise`` if ``names`` is empty."""
     if name not in names:
         raise field_error(path, name, f"the name of {kind}, of {shown(names)}" if names else otherwise)
 
 
 def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST, le: float = GREATEST) -> Any:
-    """Describe a field with a finite number in a unit; "-" means a plain number."""
+    """Describe a field for a finite number with a unit. The unit "-" means that the number has no unit."""
     least = ge if gt is None else max(ge, 1.0 / GREATEST)
     return Field(strict=True, allow_inf_nan=False, gt=gt, ge=least, le=le, json_schema_extra={"unit": unit})
 
@@ -72,14 +71,14 @@ def count(least: int, most: int) -> Any:
 
 
 def components(*names: str) -> Any:
-    """Describe a field with a list of named components, equal in 2-D and 3-D, such as a colour."""
+    """Describe a field for a list of named components, such as a colour."""
     extra: Any = {"components": list(names)}
     return Field(min_length=len(names), max_length=len(names), fail_fast=True, json_schema_extra=extra)
 
 
 @dataclass(frozen=True)
 class OneOf:
-    """Mark of a field whose value must be a name in a registry."""
+    """Marks a field for the name of an entry in a registry."""
 
     names: Collection[str]
 
@@ -89,10 +88,10 @@ class OneOf:
 
 @dataclass(frozen=True)
 class OrWord:
-    """Mark of a field whose value is a number or a certain word."""
+    """Marks a field for a number or a special word such as "auto"."""
 
     number: Any
-    """The number's `quantity`."""
+    """Description of the number, from `quantity`."""
     word: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -110,7 +109,7 @@ class OrWord:
 Item = TypeVar("Item")
 PER_AXIS = "per axis"
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
-"""A vector or flags, one for each axis. The 2-D default is the first two components of the 3-D default."""
+"""A vector with one entry for each axis. In 2-D the default is the first two entries of the default in 3-D."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
 Text = Annotated[str, Field(strict=True, pattern=r"\S")]
 Flag = Annotated[bool, Field(strict=True)]
@@ -119,7 +118,7 @@ Colour = Annotated[tuple[Annotated[float, quantity(ge=0.0, le=1.0)], ...], compo
 
 
 def without_numpy(value: Any) -> Any:
-    """Convert NumPy's arrays and numbers, also inside a list, to Python's lists and numbers."""
+    """Convert NumPy arrays and numbers to Python lists and numbers."""
     if isinstance(value, (list, tuple)):
         return [entry.tolist() if isinstance(entry, (np.ndarray, np.generic)) else entry for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
@@ -133,7 +132,7 @@ def _in_a_list(value: Any) -> Any:
 
 
 def _few(most: int) -> Any:
-    """Describe a field with one number in 2-D, and a list in 3-D."""
+    """Describe a field for one number in 2-D, and for a list of numbers in 3-D."""
     return Field(min_length=1, max_length=most, fail_fast=True, json_schema_extra={"maxItemsIn2D": 1})
 
 
@@ -154,7 +153,8 @@ def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstrings of fields by name, including those of parent classes; empty without source code."""
+    """Return the docstrings of fields by name, with the fields of base classes. The result is empty if the source code
+    is not available."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
         found |= _of_module(one.__module__).get(one.__qualname__, {})
@@ -185,7 +185,7 @@ UNKNOWN = Words("unknown")
 
 @contextmanager
 def sentences(model: type[BaseModel]) -> Iterator[None]:
-    """Convert pydantic's first error about a model into a `SceneError`."""
+    """Convert pydantic's first error about a model to a `SceneError`."""
     try:
         yield
     except ValidationError as error:
@@ -194,7 +194,7 @@ def sentences(model: type[BaseModel]) -> Iterator[None]:
 
 @contextmanager
 def usable_file(path: FieldPath, file: str | None, wanted: str) -> Iterator[None]:
-    """Convert an `InputError` about a file into a `field_error` of the field that names the file."""
+    """Convert an `InputError` about a file to a `field_error` about the field at ``path``."""
     try:
         yield
     except InputError as error:
@@ -245,7 +245,6 @@ def _schema_of(model: type[BaseModel]) -> Schema:
 
 
 def _homes(whole: Schema, path: FieldPath) -> list[str]:
-    """Return the other paths in a JSON schema with the same last key; empty if there are more than `MOST_HOMES`."""
     key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
     found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
     words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
@@ -264,13 +263,12 @@ def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]
 
 
 def _is_out_of_size(number: float, schema: Schema) -> bool:
-    """Test whether a number is too large or, above 0, too small for any quantity."""
     tiny = 0.0 < number < schema["minimum"] == 1.0 / GREATEST
     return schema["type"] == "number" and (tiny or abs(number) > GREATEST)
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """Return the part of a JSON schema at a location from pydantic, and its path without names of union members."""
+    """Return the part of a JSON schema at a location that pydantic reports, and the path of the field."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -315,11 +313,11 @@ ALSO_CALLED = {
 
 
 class Table(BaseModel, metaclass=Documented):
-    """A table of a scene: immutable, without unknown keys. A wrong value raises a `SceneError`."""
+    """A table of a scene. It is immutable and has no unknown keys. An invalid value raises a `SceneError`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
-    """Other tables that a file may contain, for advice about unknown keys."""
+    """Tables of other modules that a file may contain."""
 
     def __init__(self, /, **data: Any):
         with sentences(type(self)):
@@ -358,7 +356,7 @@ class Table(BaseModel, metaclass=Documented):
         return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return the table for 2 or 3 dimensions, with checked vectors, of which defaults are cut to ``dimension``."""
+        """Return the table for 2 or 3 dimensions, after a check of its vectors."""
         vectors = [name for name, field in type(self).model_fields.items() if PER_AXIS in field.metadata]
         defaults = {name: getattr(self, name)[:dimension] for name in vectors if name not in self.model_fields_set}
         placed = self.model_copy(update=defaults)
@@ -366,7 +364,7 @@ class Table(BaseModel, metaclass=Documented):
         return placed
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` if one of these fields does not have ``dimension`` components."""
+        """Raise a `field_error` if the vector in a field of ``names`` does not have ``dimension`` components."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
@@ -374,8 +372,7 @@ class Table(BaseModel, metaclass=Documented):
                 raise field_error((*path, name), value, wanted)
 
     def _check_turns(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` if a rotation or an angular velocity among these fields does not have 1 component in
-        2-D and 3 in 3-D."""
+        """Raise a `field_error` if a rotation or an angular velocity does not have 1 component in 2-D or 3 in 3-D."""
         for name in names:
             if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
                 wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"

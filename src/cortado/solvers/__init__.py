@@ -1,4 +1,4 @@
-"""Solvers, the algorithms for a step: their protocol, their common parts, PCISPH and the projection."""
+"""Solvers: their protocol, their common parts, PCISPH and the projection."""
 
 from typing import TYPE_CHECKING
 

@@ -1,5 +1,4 @@
-"""Makers of forces and solvers, which `Simulation` takes as ``forces`` and ``solver`` and which a scene names by
-kind."""
+"""Makers of forces and solvers, for the arguments ``forces`` and ``solver`` of `Simulation` and for scenes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -59,23 +58,24 @@ from cortado.sph.stress_forces import LAWS
 
 
 class ForceMaker(Protocol):
-    """A maker that makes a force for each solver of a simulation and lists the force's parameters.
+    """Protocol of a maker of forces. It lists the parameters of the force, and makes the force for each solver of a
+    simulation.
 
     The maker is pickled with the simulation. An optional text ``fingerprint`` identifies the maker when a search
-    resumes; by default the maker's type and attributes do. An optional method ``check(values, simulation)`` raises
-    `InputError` for parameter values, by name, with which no run is possible.
+    resumes. An optional method ``check(values, simulation)`` raises `InputError` for impossible parameter values by
+    name.
     """
 
     parameters: Sequence[Parameter]
-    """Parameters of the force, with unique names; kernels read ``drag.k`` as their argument ``drag_k``. If kernels read
-    ``time``, `known.TIME` must be among the parameters."""
+    """Parameters of the force, with unique names. Kernels read the parameter ``drag.k`` as their argument ``drag_k``.
+    If kernels read ``time``, `known.TIME` must be among the parameters."""
 
     def force(self, setting: Setting) -> Force | None:
-        """Make the force in one precision and on one device; return None if no force acts."""
+        """Make the force for one precision and one device, or return None without a force."""
 
 
 def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
-    """Return ``forces`` as a tuple; raise `InputError` if an entry is not a maker of forces."""
+    """Return ``forces`` as a tuple. Raise `InputError` if an entry is not a maker of forces."""
     if not isinstance(forces, (list, tuple)):
         wanted = "a list of forces, such as [cortado.forces.Body(function, k=2.0)]"
         raise InputError(f"forces is {shown(forces)}, but must be {wanted}.")
@@ -88,15 +88,15 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
 
 
 def check_parameters(what: str, maker: Any, parameters: Any) -> None:
-    """Raise `InputError` if the parameters of a maker of ``what`` are not a list of `Parameter`."""
+    """Raise `InputError` unless ``parameters`` is a list of `Parameter`. ``what`` is "force" or "solver"."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
         wanted = "a list of cortado.scene.parameters.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
 
 
 def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
-    """Return all parameters of a simulation; raise `InputError` if two parameters have one name or two forces replace
-    the same force."""
+    """Return all parameters of a simulation. Raise `InputError` if two parameters have the same name, or if two makers
+    replace the same force of the scene."""
     taken: dict[str, ForceMaker] = {}
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
@@ -112,14 +112,14 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
 
 
 def check_own(known: Known, source: Source) -> None:
-    """Raise `InputError` if the shape of a parameter's value does not fit the scene."""
+    """Raise `InputError` if the shape of a value does not fit the scene."""
     for parameter in known.own:
         shapes = parameter.shapes(0, len(source.scene.phase), source.positions.shape)
         checked_value(parameter.name, parameter.value(source), shapes, known=known)
 
 
 def fingerprint(makers: Sequence[Any], source: Source) -> str:
-    """Return a hash of makers and their parameters' values; return an empty text without makers."""
+    """Return a hash of makers and their parameter values, or an empty text without makers."""
     words = []
     for maker in makers:
         parameters = getattr(maker, "parameters", ())
@@ -130,7 +130,7 @@ def fingerprint(makers: Sequence[Any], source: Source) -> str:
 
 @dataclass(frozen=True)
 class SolverSetting:
-    """The arguments from which a solver is made; `particle_system` makes the particles from them."""
+    """The arguments for making a solver."""
 
     scene: Scene
     discrete: DiscreteScene
@@ -139,26 +139,26 @@ class SolverSetting:
     device: Any
     batch: int | None
     forces: Sequence[ForceMaker]
-    """Makers of the forces that the scene does not name."""
+    """Makers of user-defined forces."""
     known: Known
     called: str
     lanes: int | None = None
-    """Number of GPU threads for each particle; with None, `cortado.device.precision` chooses the number."""
+    """Number of GPU threads for each particle; None for an automatic choice."""
 
 
 class SolverMaker(Protocol):
-    """A maker of the solver of a simulation, and of every simulation derived from it in another precision or size.
+    """Protocol of a maker of a solver. A simulation and all simulations derived from it use the same maker.
 
-    The maker is pickled with the simulation. Its optional ``parameters`` are read by kernels by name, and an optional
-    text ``fingerprint`` identifies the maker. ``batches = True`` declares that its solver runs in batches.
+    The maker is pickled with the simulation. Kernels read its optional ``parameters`` by name. An optional text
+    ``fingerprint`` identifies the maker. ``batches = True`` declares that its solver supports batches.
     """
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the solver for a setting, in one precision and on one device."""
+        """Make the solver for one precision and one device."""
 
 
 def checked_solver(solver: Any) -> SolverMaker:
-    """Return ``solver`` if it is a maker of solvers; otherwise raise `InputError`."""
+    """Return ``solver`` if it is a maker of solvers; else raise `InputError`."""
     if isinstance(solver, type) or not callable(getattr(solver, "build", None)):
         wanted = "an object with a method build(setting), which returns a solver: see docs/own_parts.md"
         raise InputError(f"solver is {shown(solver)}, but must be {wanted}.")
@@ -174,7 +174,6 @@ NEEDED = ("new_parameters", "new_log", "set_substeps", "reset", "make_room", "st
 
 
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
-    """Build a solver; raise `InputError` if the solver does not fit the simulation."""
     if setting.batch is not None and not getattr(maker, "batches", False):
         raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} has no batches.")
     solver = maker.build(setting)
@@ -190,7 +189,6 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
 
 
 def solver_named(table: SolverTable) -> SolverMaker:
-    """Return the maker of the solver for a scene's table [solver]."""
     if isinstance(table, PackageSolver):
         return checked_solver(table.make())
     made: SolverMaker = import_module(f"cortado.solvers.{table.kind}.solver").maker(table)
@@ -198,7 +196,7 @@ def solver_named(table: SolverTable) -> SolverMaker:
 
 
 def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
-    """Return makers of a scene's laws of viscosity and of its forces from installed packages."""
+    """Return makers of the viscosity laws in a scene, and of forces from installed packages."""
     laws = [
         Rheology(LAWS[phase.rheology.kind], None, **phase.rheology.numbers(phase.viscosity))
         for phase in scene.phase
@@ -208,7 +206,7 @@ def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
 
 
 def known_in(scene: Scene) -> Known:
-    """Return the parameters of a scene; raise `InputError` if two parameters have one name."""
+    """Return the parameters of a scene. Raise `InputError` if two parameters have the same name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
     if not (own or scene.emitter or scene.drain or moving(scene.solid)):
         return REGISTRY
@@ -217,17 +215,17 @@ def known_in(scene: Scene) -> Known:
 
 FORCE_ATTRIBUTES = ("shares", "accelerate", "tangent", "adjoint")
 PART_METHODS = ("begin", "sort", "settle", "target", "end", "new_tangent", "new_adjoint")
-"""Methods that a `Part` has and a plain `Force` lacks."""
+"""Methods of a `Part` that a `Force` lacks."""
 
 
 def first_capacity(support: float, dimension: int) -> int:
-    """Return the first capacity of neighbour lists, 1.5 times the number on the lattice; ``support`` is in spacings."""
+    """Return the initial capacity of neighbour lists. ``support`` is the support radius [spacings]."""
     filled = np.pi * support**2 if dimension == 2 else 4.0 / 3.0 * np.pi * support**3
     return int(1.5 * filled) + 6
 
 
 def particle_system(setting: SolverSetting) -> ParticleSystem:
-    """Discretise the scene of a setting into particles on a device, with all forces."""
+    """Discretise a scene into particles on a device, with all forces."""
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, numbers = lanes_for(layout.particles, device, setting.lanes), wall_numbers(scene.solid)
@@ -290,7 +288,6 @@ def _search(
 
 
 def _forces(setting: Setting, makers: Sequence[ForceMaker]) -> list[Force]:
-    """Make the forces of a scene's parameters, in the order of the registry, and then the forces of the makers."""
     replaced, scene = {getattr(maker, "replaces", None) for maker in makers}, setting.scene
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
     forces: list[Force] = []
@@ -302,8 +299,6 @@ def _forces(setting: Setting, makers: Sequence[ForceMaker]) -> list[Force]:
 
 
 def _check_force(force: Force, maker: Any, batch: int | None) -> None:
-    """Raise `InputError` if a force lacks an attribute, has methods of a `Part` that no step would call, or lacks
-    batches."""
     name = type(force).__name__
     if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
         made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
@@ -326,7 +321,7 @@ def _check_force(force: Force, maker: Any, batch: int | None) -> None:
 def _parts(
     setting: SolverSetting, discretisation: Discretisation, search: NeighbourSearch, free: FreeSolids | None
 ) -> list[PartMaker]:
-    """Make the parts that are not forces, in the order in which a step calls their `end`."""
+    """Make the parts of a step that are not forces, in their order."""
     scene, count, phases = setting.scene, len(setting.scene.phase), Phases(1, None, 0.0)
     if count > 1:
         mobility = MOBILITIES[scene.mixture.mobility_form]
@@ -342,7 +337,6 @@ def _parts(
 def _free_solids(
     setting: SolverSetting, search: NeighbourSearch, layout: Layout, still: list[Obstacle], moved: list[Obstacle]
 ) -> FreeSolids | None:
-    """Make the part that moves free bodies with the fluid; return None without free bodies."""
     scene, spacing, periods = setting.scene, setting.scene.discretisation.spacing, setting.discrete.periods
     solids, tables = moving(scene.solid), []
     for number, table in enumerate(solids):
@@ -362,7 +356,6 @@ def _free_solids(
 
 
 def _touching(setting: SolverSetting, still: list[Obstacle], moved: list[Obstacle]) -> list[Touching]:
-    """List for each free body the solids that it may touch: all solids at rest, and each other moving solid."""
     scene, walls, spacing = setting.scene, setting.discrete.walls, setting.scene.discretisation.spacing
     tables = moving(scene.solid)
     bodies = [number for number, table in enumerate(tables) if table.motion == "free"]

@@ -51,13 +51,11 @@ from cortado.sph.moving_solids import free_module, hold_type
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 STIFFNESS = 0.04
-"""Stiffness q of contacts [-]."""
+"""Stiffness of contacts [-]."""
 FAR = 1e6
-"""Greatest distance at which faces are searched [m]."""
+"""Greatest distance of the search for faces [m]."""
 SHARES = ("pushes", "drags", "scales")
-"""Terms of a surface point. ``pushes`` has the columns d^3 n and its moments about the middles of both solids.
-``drags`` has the same columns for d^3 times the momentum that stops the point. ``scales`` has d^3, d^4, both with d
-before the step, and the length of that momentum."""
+"""Names of arrays with terms of surface points: normal momentum, friction momentum and weights."""
 OWN = ("before", "turned_before", "after", "turned")
 POSES = ("before", "turns_before", "after", "turns")
 NUMBERS = ("time_step", "density", "other_density")
@@ -65,9 +63,11 @@ NUMBERS = ("time_step", "density", "other_density")
 
 @cache
 def contact_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of contact: ``look`` and ``push`` have a thread for each surface point in each scene, ``give``
-    has one for each scene. ``push`` computes `SHARES` from poses, scale, lift (`lift_kernels`) and `NUMBERS`, and
-    ``give`` turns their sums into momenta of both solids, 0 for a solid that is not free."""
+    """Make the kernels of contacts.
+
+    ``look`` finds the depth of each surface point. ``push`` computes the points' terms of momenta. ``give`` adds the
+    sums of the terms to the momenta of both solids.
+    """
     real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
     modules, stiffness = [free_module(precision, "contacts")] * 3, wp.constant(real(STIFFNESS))
 
@@ -77,7 +77,7 @@ def contact_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def along(way: real, length: real) -> real:
-        """Return a separation along one axis [m] as that of the nearest periodic image."""
+        """Return a distance along an axis to the nearest periodic image [m]."""
         found = way
         if length > real(0.0):
             found = way - length * wp.round(way / length)
@@ -95,7 +95,7 @@ def contact_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def ease(density: real, other: real, volumes: pair, greatest: pair, is_free: bool, arms: pair) -> real:
-        """Return 1 / m of a push, given the squared arms about the middles of both solids."""
+        """Return the inverse of the effective mass of two solids in contact."""
         found = (one / volumes[0] + greatest[0] * arms[0]) / density
         if is_free:
             found += (one / volumes[1] + greatest[1] * arms[1]) / other
@@ -111,7 +111,6 @@ def contact_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def eased(t: real) -> real:
-        """Return (1 + t^8)^(-1/8)."""
         fourth = (t * t) * (t * t)
         return one / wp.sqrt(wp.sqrt(wp.sqrt(one + fourth * fourth)))
 
@@ -121,9 +120,7 @@ def contact_kernels(precision: Precision) -> SimpleNamespace:
         after, turns, other_after, other_turns, other_scales,
         of: bundle(face=vector, plane=real, shift=vector, depth=real),
     ):  # fmt: skip
-        """Find the face behind which a point is deepest. The mesh is centred on ``origin`` for a solid at rest, and on
-        ``inner`` in the frame of a moving solid. ``axes`` is 1 along the scene's axes; its 0 along z in the plane
-        removes the 1e-18 that a GPU's fused products leave in the normal."""
+        """Find the depth of a surface point in the mesh of a solid, and the face above the point."""
         j = wp.tid()
         b = j // particles
         way = after[b] + turns[b] * own[j] - other_after[b] - origin
@@ -216,16 +213,16 @@ class Touching:
     """A free body and solids that it may touch: all solids at rest, or one moving solid."""
 
     body: int
-    """Number of the body among the free bodies."""
+    """Index of the body among the free bodies."""
     against: int
-    """Number of the other solid among the moving solids; -1 for solids at rest."""
+    """Index of the touched solid among the moving solids; -1 for solids at rest."""
     other: int
-    """Number of the other solid among the free bodies; -1 if it is not free."""
+    """Index of the touched solid among the free bodies; -1 if it is not a free body."""
     obstacles: Sequence[Obstacle]
     points: NDArray[np.float64]
-    """(n, d) points of the body's surface in the body's frame [m]"""
+    """Points of the body's surface, in the frame of the body (n, d) [m]."""
     slides: Sequence[float] = ()
-    """(d,) velocity of the other solid's sliding surface, in the solid's frame [m/s]"""
+    """Velocity of the touched solid's sliding surface, in the solid's frame (d,) [m/s]."""
 
 
 class Contact:
@@ -244,21 +241,21 @@ class Contact:
         self.own = wp.array(np.tile(points, (layout.members, 1)), dtype=vector, device=device)
         self.all = layout.members * self.count
         self.found = self.arrays({"face": vector, "plane": real, "shift": vector, "depth": real})
-        """The faces above points of the body, written by the kernel ``look``."""
+        """Nearest faces above the surface points of the body."""
 
     def arrays(self, kinds: Mapping[str, Any]) -> Arrays:
         return {name: wp.zeros(self.all, dtype=kind, device=self.layout.device) for name, kind in kinds.items()}
 
     def poses(self, each: Sequence[Named]) -> Named:
-        """Return pose, scale and tangents of the other solid by the names of kernel arguments, given those of all
-        moving solids."""
+        """Return the pose, scale and tangents of the touched solid by names of kernel arguments. ``each`` has the
+        arrays of all moving solids."""
         against = self.touching.against
         other = resting_pose(self.layout) if against < 0 else each[against]
         return {f"other_{name}": array for name, array in other.items()}
 
 
 class Totals:
-    """Arrays of values of a body's points, and their sums over each scene."""
+    """Terms of the surface points of a body, and the sums of the terms over each scene."""
 
     def __init__(self, contact: Contact, kinds: Mapping[str, Any], suffix: str = "", end: str = "_sum"):
         layout = contact.layout
@@ -269,7 +266,6 @@ class Totals:
         }
 
     def sums(self) -> Arrays:
-        """Sum the values over each scene, to arrays (members,) by name."""
         pairs = zip(self._totals.items(), self.each.values(), strict=True)
         return {name: total(array) for (name, total), array in pairs}
 
@@ -280,8 +276,6 @@ def share_kinds(layout: Layout) -> dict[str, Any]:
 
 
 class Contacts:
-    """The contacts of a solver's free bodies; each step looks for contacts once poses are known."""
-
     def __init__(
         self,
         part: FreeSolidsPart,
@@ -290,7 +284,8 @@ class Contacts:
         periods: NDArray[np.float64],
         layout: Layout,
     ):
-        """Prepare contacts; ``periods`` (d,) [m] are 0 along axes without one."""
+        """Prepare contacts. ``periods`` (d,) are the lengths of the periodic box [m], 0 along axes that are not
+        periodic."""
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         self._poses = [contact.poses(part.made_of.walls.each) for contact in self.contacts]
@@ -304,13 +299,12 @@ class Contacts:
             for label, value in unsaid.items()
             for suffix in ("", "_dot", "_bar")
         }
-        """Default friction and restitution of bodies without these keys; nothing reads their tangents and adjoints."""
+        """Default coefficients of friction and restitution."""
         self.lifts = lift_kernels(layout.precision)
         self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
-        """Return the body of a contact and the other free body; return the first body twice if the other solid is not
-        free."""
+        """Return the two free bodies of a contact. If only one solid is a free body, return it twice."""
         touching, bodies = self.contacts[number].touching, self.part.bodies
         own = bodies[touching.body]
         return own, own if touching.other < 0 else bodies[touching.other]
@@ -325,7 +319,8 @@ class Contacts:
         return *known, self._poses[number], own.constants, self.lift
 
     def numbers(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
-        """Return the parameters of both solids, or their tangents or adjoints, by the names of kernel arguments."""
+        """Return the parameters of the two solids by names of kernel arguments. ``suffix`` selects tangents or
+        adjoints."""
         found = {f"time_step{suffix}": parameters["time_step"]}
         for way, body in zip(("", "other_"), self.bodies(number), strict=True):
             name, weight = body.table.name, body.table.weight
@@ -336,12 +331,11 @@ class Contacts:
         return found
 
     def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
-        """Return the momenta of both solids, or their tangents or adjoints."""
+        """Return the momenta of the two solids, or the tangents or adjoints of the momenta."""
         touching = self.contacts[number].touching
         return given_to(each, touching.body, touching.other)
 
     def look(self, step: StepContext) -> None:
-        """Find the contacts of a step, and add their momenta to the bodies."""
         step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
             for array in contact.found.values():
@@ -391,7 +385,7 @@ class ContactsAdjoint:
         self._sums = zeros(sums, layout.device)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
-        """Turn adjoints of the bodies' momenta into adjoints of poses, densities and the time step."""
+        """Convert adjoints of bodies' momenta to adjoints of their poses, their densities and the time step."""
         contacts, members = self._contacts, self._contacts.layout.members
         for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
             numbers = contacts.numbers(bar.parameters, number, "_bar")

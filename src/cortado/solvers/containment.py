@@ -1,5 +1,7 @@
-"""A search for lost particles at the end of every step, on the device. Particles are lost if they are outside of their
-container, in a solid, too far away, or not finite."""
+"""Finds lost particles at the end of every step.
+
+A particle is lost if it is outside the container, inside a solid, too far away, or not finite.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,13 +22,13 @@ from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
-"""Value in place of a particle's number while no particle is lost."""
+"""Index for "no particle is lost"."""
 
 
 @cache
 def bounds_type(precision: Precision) -> Any:
-    """Return the Warp struct of a container. ``up`` is the unit vector along the axis of an open cup, and 0 for others;
-    ``nearest`` and ``furthest`` are corners of the box that particles must not leave."""
+    """Return the Warp struct of a container. ``up`` is the upward unit vector of an open cylinder, and 0 for other
+    containers. ``nearest`` and ``furthest`` are corners of the largest allowed box."""
     real = precision.real
     vectors = dict.fromkeys(("lower", "upper", "base", "across", "up", "nearest", "furthest"), precision.vector)
     return struct_of("Bounds", precision, **vectors, radius=real, rim=real)
@@ -34,11 +36,12 @@ def bounds_type(precision: Precision) -> Any:
 
 @cache
 def solids_type(precision: Precision) -> Any:
-    """Return the Warp struct of solids and their ``meshes``, of which ``still`` are at rest and come first. ``middles``
-    are the centres of meshes [m]: in space for solids at rest, in the solid's frame for moving solids. ``sides`` is 1
-    where fluid is outside of a mesh and -1 where it is inside. Arrays (members, solids): poses of moving solids before
-    and after a step, and ``scales``, by which solids are larger than their meshes. ``period`` [m] and its inverse
-    ``frequency`` are 0 along an axis that is not periodic."""
+    """Return the Warp struct of solids and their ``meshes``.
+
+    The first ``still`` solids are at rest. ``middles`` are the centres of meshes [m]. ``sides`` is 1 for fluid outside
+    a mesh and -1 for fluid inside. The arrays (members, solids) contain poses before and after a step, and scales.
+    ``period`` are the lengths of the periodic box [m].
+    """
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     meshes = {"meshes": wp.array(dtype=wp.uint64), "still": wp.int32, "middles": wp.array(dtype=vector)}
     poses = dict.fromkeys(("before", "after"), wp.array2d(dtype=vector))
@@ -57,7 +60,6 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def between(x: vector, lower: vector, upper: vector) -> bool:
-        """Test that x lies in a box; False for NaN."""
         return (
             x[0] >= lower[0]
             and x[1] >= lower[1]
@@ -85,7 +87,7 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def seen_from(x: vector, k: int, member: int, positions: poses, turns: turnings, solids: solids_struct) -> vector:
-        """Return x in the frame of the mesh of solid k, as nearest periodic image."""
+        """Return the nearest periodic image of ``x`` in the frame of solid ``k``."""
         if k < solids.still:
             return nearest_image(x - solids.middles[k], solids)
         away = nearest_image(x - positions[member, k - solids.still], solids)
@@ -93,8 +95,7 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
-        """Test whether y, in the frame of solid k's mesh, is deeper in the solid than its tolerance; False far from the
-        surface."""
+        """Test if the point ``y`` is deeper in solid ``k`` than its tolerance."""
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
         depth = real(0.0)
@@ -113,8 +114,7 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def has_entered(before: vector, x: vector, member: int, solids: solids_struct) -> bool:
-        """Test whether a particle is deep in a solid now and was in no solid before the step. Finding the side of a
-        surface is slow, so only surfaces within the distance moved plus the tolerance are tested."""
+        """Test if a particle moved from outside all solids deep into a solid."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.after, solids.turns, solids)
             gone = wp.length(y - seen_from(before, k, member, solids.before, solids.turns_before, solids))
@@ -140,14 +140,11 @@ def lost_kernel(precision: Precision) -> Any:
         bounds: bounds_struct, solids: solids_struct, particles: int, first_waiting: int, order, x_before, rho_0,
         x_free, v_free, x, bad_step, bad, count,
     ):  # fmt: skip
-        """Write to ``bad`` the first lost particle of each scene, in scene order, and to ``count`` the number of lost
-        particles. Scenes with an earlier bad step are skipped.
+        """Write the first lost particle of each scene to ``bad``, and the number of lost particles to ``count``.
 
-        A particle is lost if it is not finite, too far away, a mixture without volume, or went through a wall: it was
-        inside before the step and is outside or in a solid after it. Fluid may cross the rim of an open cup. Particles
-        from ``first_waiting`` on, in scene order, may pass walls if a nozzle or a drain moves them. ``x``:
-        positions after the step, in scene order. ``x_free`` and ``v_free``: sorted positions and velocities after the
-        step, before nozzles and drains change them.
+        A particle is lost if it is not finite, too far away, without volume, or went through a wall. Fluid may flow
+        over the rim of an open container. Particles from ``first_waiting`` on may pass through walls when an emitter or
+        a drain moves them.
         """
         i = wp.tid()
         member = i // particles
@@ -179,15 +176,15 @@ def lost_kernel(precision: Precision) -> Any:
 
 
 REACH = 4.0
-"""Greatest distance from a surface at which particles are tested against it [spacings]."""
+"""Greatest distance from a surface at which particles are tested [spacings]."""
 
 Distance = Callable[[Points], Points]
-"""Function that returns distances (n,) of points (n, d) outside of a wall [m]."""
+"""Function from points (n, d) to signed distances from a wall (n,) [m], positive outside."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """The first particles that a scene has lost, all in one step."""
+    """The first lost particles of a scene, all in the same step."""
 
     step: int
     particle: int
@@ -198,8 +195,7 @@ class Containment:
     def __init__(
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
-        """Prepare the search; particles from ``first_waiting`` on, in the scene's order, may wait in a nozzle or be
-        removed by a drain."""
+        """Prepare the search. Particles from ``first_waiting`` on may be moved by an emitter or a drain."""
         self.walled, self._precision, self._launch = walled, layout.precision, launch
         self._kernel = lost_kernel(layout.precision)
         members, device = layout.members, layout.device
@@ -209,14 +205,14 @@ class Containment:
         self._constants: dict[str, Any] = {"particles": layout.particles, "first_waiting": first_waiting}
         self._constants |= {"bounds": self._made_bounds(), "solids": self._made_solids(device)}
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
-        """(members,) first step in which a scene lost a particle, or -1"""
+        """First step with a lost particle in each scene, or -1 (members,)."""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
-        """(members,) first particle lost in that step, or `NO_PARTICLE`"""
+        """First lost particle of each scene, or `NO_PARTICLE` (members,)."""
         self._count = wp.zeros(members, dtype=wp.int32, device=device)
         self._seen = HostCopy(self.bad_step)
 
     def reset(self, step: int = 0) -> None:
-        """Forget the particles that were lost from a step on."""
+        """Forget particles that were lost in step ``step`` or later."""
         steps = self.bad_step.numpy() if step > 0 else np.array([-1])
         kept = (steps >= 0) & (steps < step)
         for array, well in ((self.bad_step, -1), (self.bad_particle, NO_PARTICLE), (self._count, 0)):
@@ -228,14 +224,15 @@ class Containment:
     def look(
         self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
     ) -> None:
-        """Look for lost particles, given sorted arrays before the step, sorted ``x_free`` and ``v_free`` after it
-        without nozzles and drains, and the new state."""
+        """Find lost particles at the end of a step. ``order``, ``x_before`` and ``rho_0`` are from before the step.
+        ``x_free`` and ``v_free`` are the new positions and velocities without emitters and drains. ``state`` is the new
+        state."""
         known = {"order": order, "x_before": x_before, "rho_0": rho_0, "x_free": x_free, "v_free": v_free}
         found = {"bad_step": self.bad_step, "bad": self.bad_particle, "count": self._count}
         self._launch(self._kernel, self._constants, known, found, x=state.positions)
 
     def lost(self) -> dict[int, Lost]:
-        """Return the particles lost since `reset`, by the number of their scene; reads from the device."""
+        """Return the lost particles since `reset`, by scene number."""
         steps = self._seen.read()
         members = np.flatnonzero(steps >= 0).tolist()
         if not members:
@@ -248,7 +245,7 @@ class Containment:
         return self._precision.furthest * self.walled.spacing < distance < np.inf
 
     def where(self, position: np.ndarray) -> str:
-        """Describe how a particle that is now at a position (d,) [m] was lost."""
+        """Describe where a lost particle at ``position`` (d,) [m] is."""
         place = f"({', '.join(f'{x:g}' for x in position)}) m"
         if not np.isfinite(position).all():
             return "has no finite position"
@@ -264,8 +261,7 @@ class Containment:
         return f"at {place} has no finite velocity or no volume"
 
     def walls(self, member: int) -> Iterator[tuple[str, Distance]]:
-        """Yield the sides of the container and the solids of a scene after the last step, with names for messages and
-        functions of distance."""
+        """Yield the name and the distance function of each wall and solid of a scene after the last step."""
         for side in self.walled.region.sides():
             yield "the container", side
         for one, distance in self._solids(member):
@@ -317,22 +313,20 @@ class Containment:
 
 
 def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: float, points: Points) -> Points:
-    """Return distances (n,) [m] of points (n, d) from a solid that is turned, scaled and moved to ``middle``."""
     d = points.shape[1]
     return np.asarray(scale * one.solid.distance((points - middle[:d]) @ turn[:d, :d] / scale))
 
 
 NARROW = 0.95
-"""Gap [spacings] below which two walls press on particles between them."""
+"""Smallest gap between two walls that does not squeeze particles [spacings]."""
 FACING = -0.5
-"""Bound on the scalar product of the normals of two walls that face one another; corners of 90 degrees have 0."""
+"""Greatest scalar product of the normals of two facing walls."""
 STEP = 1e-3
-"""Step h of the central differences from x - h to x + h for normals [spacings]."""
+"""Step of finite differences for normals [spacings]."""
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Name the walls of a scene between which points (n, d) [m] are shut in after the last step; None if all points
-    have room."""
+    """Return the names of walls with too narrow a gap at the points (n, d) [m] after the last step, or None."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [
@@ -354,6 +348,5 @@ def shut_in(containment: Containment, member: int, points: Points) -> str | None
 
 
 def _normals(distance: Distance, points: Points, step: float) -> Points:
-    """Return normals (n, d) of a wall at points (n, d) [m], by central differences over a step [m]."""
     moves = step * np.eye(points.shape[1])
     return np.stack([(distance(points + move) - distance(points - move)) / (2.0 * step) for move in moves], axis=1)

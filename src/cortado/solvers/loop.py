@@ -1,4 +1,4 @@
-"""Loops of a step, which iterate until an error is small enough; kernels decide when to stop and record every step."""
+"""Iterations within a time step that end when the errors are small enough. Kernels decide when to stop."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -20,18 +20,17 @@ from cortado.solvers.containment import NO_PARTICLE, Containment
 from cortado.solvers.solver import Counts
 
 UNKNOWN = 2**31 - 1
-"""Value in place of a number of iterations while a loop runs."""
+"""Number of iterations of a loop that has not ended."""
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A reduction of all particles' errors, a pair of numbers each, to one or two numbers a step."""
+    """A reduction of the errors of all particles to one or two numbers per step."""
 
     columns: tuple[str, ...]
-    """Names of these numbers in diagnostics, formatted with the loop's name; a tolerance bounds the first."""
+    """Names of the reduced numbers in diagnostics."""
     is_weighted: bool
-    """True if a pair is a weighted square and its weight, reduced to the root of the weighted mean. Otherwise a pair
-    has the error twice, reduced to average and maximum."""
+    """True for a weighted root mean square, False for average and maximum."""
 
 
 AVERAGE = Measure(("{}", "greatest_{}"), is_weighted=False)
@@ -40,7 +39,7 @@ ROOT_MEAN_SQUARE = Measure(("{}",), is_weighted=True)
 
 @cache
 def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> SimpleNamespace:
-    """Make the kernels that count and stop iterations, with one thread for each scene."""
+    """Make the kernels that count and stop iterations."""
     real, pair = precision.real, precision.pair
     module = kernel_module(f"convergence_{precision.name}{'_weighted' * measure.is_weighted}")
 
@@ -63,8 +62,8 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
     def decide(
         done: int, most: int, particles: int, tolerance: real, greatest_tolerance: real, sums, iteration, rounds, active
     ):
-        """Add ``done`` iterations to the counts, set ``rounds`` of scenes whose error is below the tolerances, and
-        subtract these scenes from ``active``."""
+        """Add ``done`` to the number of iterations, and stop scenes that have converged or reached ``most``
+        iterations."""
         b = wp.tid()
         if rounds[b] != wp.static(UNKNOWN):
             return
@@ -88,8 +87,7 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
         particles: int, undecided: int, is_last: int, sums, bad, step, iteration, bad_step, rounds, active,
         iterations: wp.array2d(dtype=wp.int32), errors: wp.array2d(dtype=pair),
     ):  # fmt: skip
-        """Record a loop's iterations, with those that were ``undecided``, and its errors; after the last loop count the
-        step."""
+        """Record the number of iterations and the errors of a loop. After the last loop, increment the step number."""
         b = wp.tid()
         n = step[b]
         iterations[n, b] = iteration[b] + undecided
@@ -114,12 +112,12 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
 
 
 class IterativeSolve(Protocol):
-    """The iterative solution of a force's equations; a force has it as ``solve``."""
+    """Protocol of an iterative solve for a force. The force has it as the attribute ``solve``."""
 
     name: str
     """Name of the iterations in the diagnostics of a run."""
     count: wp.array
-    """(members,) iterations of the last solve."""
+    """Number of iterations of the last solve in each scene (members,)."""
 
 
 @dataclass(frozen=True)
@@ -127,24 +125,24 @@ class LoopLimits:
     minimum_iterations: int
     maximum_iterations: int
     tolerance: float
-    """Bound on the first number of the loop's `Measure`."""
+    """Upper bound on the average or root mean square error."""
     greatest_tolerance: float
-    """Bound on the maximum of the particles' errors; may be infinite."""
+    """Upper bound on the error of every particle; may be infinite."""
 
 
 class StepRecord:
-    """Arrays (steps, members) of a loop or a solve in each step, on the device until they are read."""
+    """Arrays (steps, members) on the device with numbers of a loop or a solve for each step."""
 
     def __init__(self, steps: int, layout: Layout, *kinds: Any):
-        """Allocate arrays of these Warp types, first the iterations."""
+        """Allocate an array of iterations, and arrays of the Warp types ``kinds``."""
         shape = (max(steps, 1), layout.members)
         self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in (wp.int32, *kinds)]
         self._seen, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
         self.diagnostics: dict[str, NDArray] = {}
-        """Diagnostics (steps,) by name of the steps that were read, in a batch (steps, batch)."""
+        """Diagnostics by name (steps,), in a batch (steps, batch)."""
 
     def values(self, steps: int) -> list[NDArray]:
-        """Read the first ``steps`` steps of each array, (steps, ...) or in a batch (steps, batch, ...)."""
+        """Return the first ``steps`` steps of each array, (steps, ...) or in a batch (steps, batch, ...)."""
         found = [copy.read(steps) for copy in self._seen]
         return [array[:, 0] if self._batch is None else array for array in found]
 
@@ -155,7 +153,7 @@ class StepRecord:
 
 
 class SolveRecord(StepRecord):
-    """Iterations of a force's solve in each step."""
+    """Numbers of iterations of a force's solve in each step."""
 
     def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
         super().__init__(steps, layout)
@@ -166,13 +164,13 @@ class SolveRecord(StepRecord):
         self.diagnostics = {self.solve.name: self.values(steps)[0].astype(int)}
 
     def note(self, launch: KernelLauncher, step: wp.array) -> None:
-        """Record the iterations of a step's solve, given the number of the step in each scene."""
+        """Record the number of iterations of a solve. ``step`` is the number of the step in each scene."""
         (iterations,) = self.arrays
         launch(self._note, count=self.solve.count, step=step, iterations=iterations, threads=iterations.shape[1])
 
 
 class LoopRecord(StepRecord):
-    """Iterations, and errors reduced by the loop's measure, of one loop in each step."""
+    """Numbers of iterations and errors of a loop in each step."""
 
     def __init__(self, steps: int, loop: "Loop"):
         super().__init__(steps, loop.layout, loop.layout.precision.pair)
@@ -187,14 +185,13 @@ class LoopRecord(StepRecord):
 
     @property
     def counts(self) -> NDArray:
-        """Return the number of iterations of each step (steps,); in a batch, of the scene with the most."""
+        """Return the number of iterations of each step (steps,); in a batch, the greatest number of all scenes."""
         found = self.diagnostics[self.loop.iterations_name]
         return found if found.ndim == 1 else found.max(axis=1)
 
     @property
     def converged(self) -> NDArray:
-        """Return booleans (steps,) or (steps, batch): errors are below the tolerances, or the number of iterations is
-        fixed."""
+        """Test for each step if the errors are within the tolerances, (steps,) or (steps, batch)."""
         limits, found = self.loop.limits, [self.diagnostics[name] for name in self.loop.columns]
         if limits is None or limits.minimum_iterations == limits.maximum_iterations:
             return np.ones(found[0].shape, dtype=bool)
@@ -203,7 +200,7 @@ class LoopRecord(StepRecord):
 
 
 class IterationLog:
-    """A `StepLog` of the records of loops and of forces' solves; without both it has only ``converged``, all True."""
+    """A `StepLog` of loops and of the solves of forces."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
         self.records = tuple(LoopRecord(steps, loop) for loop in loops)
@@ -235,7 +232,7 @@ class IterationLog:
 
 
 class Loop:
-    """A loop of iterations over all particles that ends on the device, once errors are small enough."""
+    """A loop of iterations over all particles. It ends on the device when the errors are small enough."""
 
     def __init__(
         self,
@@ -246,15 +243,15 @@ class Loop:
         errors_name: str = "density_errors",
         measure: Measure = AVERAGE,
     ):
-        """Prepare a loop, which never iterates if ``limits`` is None; the names appear in the diagnostics of a run."""
+        """Prepare a loop. With ``limits`` None it has no iterations. The names appear in diagnostics."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [column.format(errors_name) for column in measure.columns]
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
-        """Errors (n,) of particles, one pair for each; every iteration writes them."""
+        """Errors of each particle in the last iteration, as pairs of numbers (n,)."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
-        """Iterations (members,) of each scene, `UNKNOWN` until known. Iteration k must not change scenes whose number
-        is k or less."""
+        """Number of iterations of each scene (members,), or `UNKNOWN` while the loop runs. Scenes that have ended must
+        not change in later iterations."""
         self._launch, self._kernels = launch, convergence_kernels(precision, measure)
         self._sum = (
             layout.sum_of(precision.pair)
@@ -264,7 +261,7 @@ class Loop:
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
-        """Number of iterations if it is fixed; otherwise 0."""
+        """Fixed number of iterations, or 0."""
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
 
@@ -274,15 +271,15 @@ class Loop:
         self._active.fill_(self.layout.members)
 
     def seek(self, record: LoopRecord, step: int) -> int:
-        """Prepare the loop for the iterations of a recorded step, and return their number; scenes of a batch may
-        differ."""
+        """Prepare the loop to repeat a recorded step, and return its number of iterations."""
         if self.layout.members > 1:
             wp.copy(self.rounds, record.arrays[0][step])
         return int(record.counts[step])
 
     def run(self, iterate: Callable[[int], None]) -> None:
-        """Iterate until the errors are small enough. ``iterate`` takes the number of the iteration, from 0; beyond the
-        minimum, a graph captures it once, with the maximum as its argument."""
+        """Iterate until the errors are small enough. ``iterate`` is called with the number of the iteration, from 0.
+        After the minimum number of iterations, a CUDA graph repeats one call, with the maximum number as its argument.
+        """
         limits = self.limits
         if limits is None:
             return
@@ -301,7 +298,7 @@ class Loop:
             wp.capture_while(self._active, once_more)
 
     def note(self, record: LoopRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
-        """Record this step's iterations and errors; the last loop of a step counts the step."""
+        """Record the iterations and errors of this step."""
         self._launch.join()
         iterations, errors = record.arrays
         known = {"iteration": self._iteration, "rounds": self.rounds, "active": self._active, "sums": self._sums}

@@ -1,4 +1,4 @@
-"""The region open to particles with its solids as meshes, and emitters and drains in the form that a step uses."""
+"""The container and the solids of a scene as meshes, and emitters and drains, in the form that a solver uses."""
 
 import itertools
 from collections.abc import Iterator
@@ -25,14 +25,13 @@ from cortado.sph.drains import BALL, BOX, PLANE, Drained, Mouth, Pull
 from cortado.sph.emitter import Nozzle
 
 FINE = 0.2
-"""Width of the mesh faces of round solids [spacings]."""
+"""Width of the faces in meshes of round solids [spacings]."""
 HEIGHT = 100.0
-"""Height over width of the mesh of a plane shape."""
+"""Ratio of height to width of the mesh of a 2-D shape."""
 DEEPEST, THINNEST = 1.0, 0.45
-"""Depths in a solid beyond which particles are lost, in spacings and as a part of its thickness. At sharp edges, behind
-which there are few wall particles, some fluid particles enter by half a spacing."""
+"""Greatest depth of a particle in a solid: in spacings, and as a fraction of the solid's thickness."""
 FURTHEST = 1e6
-"""Distance from the first particles and walls beyond which particles are lost [spacings]."""
+"""Greatest distance of a particle from the initial scene [spacings]."""
 
 
 @dataclass(frozen=True)
@@ -40,58 +39,54 @@ class Obstacle:
     name: str
     solid: Solid
     is_hollow: bool
-    """True if the fluid is inside of the shape."""
     thickness: float
-    """Thickness of the solid's thinnest part [m]; infinite if it is unknown."""
+    """Thickness of the thinnest part of the solid [m]; infinite if it is unknown."""
 
 
 @dataclass(frozen=True)
 class NamedSolid:
     number: int
-    """Number of the solid's wall particles (`cortado.scene.motions.wall_numbers`)."""
+    """Number of the solid from `cortado.scene.motions.wall_numbers`."""
     middle: NDArray
-    """(3,) at the start [m]"""
+    """Initial position of the solid's middle (3,) [m]."""
 
 
 @dataclass(frozen=True)
 class Walled:
-    """The region where particles may go: the container and the solids in it."""
+    """The region for particles: the container and the solids."""
 
     region: Region
-    """The container without sides across a periodic axis, and without all sides if no pressure acts."""
+    """Region inside the container, unbounded along periodic axes. Without pressure the region is the whole space."""
     near: Region
     spacing: float
-    """[m]"""
     solids: tuple[Obstacle, ...]
     moving: tuple[Obstacle, ...]
-    """Moving solids, each about its middle."""
+    """Moving solids, in frames with the solid's middle as origin."""
     periods: Points
-    """(d,) lengths of the period [m], 0 for axes without one"""
+    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
 
     @property
     def dimension(self) -> int:
         return len(self.near.lower)
 
     def tolerance(self, one: Obstacle) -> float:
-        """Return the depth in a solid beyond which a particle is lost [m]."""
+        """Return the greatest allowed depth of a particle in a solid [m]."""
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """Return the box that positions must not leave [m]. The precision limits the box, except for an open cup, over
-        whose rim fluid may spill."""
+        """Return the largest allowed box of positions, which the precision of positions may limit."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
 
 
 def middle_of(one: Obstacle) -> Points:
-    """Return the middle (d,) [m] of the box around an obstacle's shape."""
     lower, upper = one.solid.extent()
     return np.asarray(0.5 * (lower + upper))
 
 
 def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
-    """Make the surface mesh of an obstacle about its middle; a plane shape becomes a tall prism."""
+    """Make the surface mesh of an obstacle, with the obstacle's middle as origin. A 2-D shape becomes a tall prism."""
     faces = one.solid.faces(FINE * spacing)
     faces = faces.reversed() if one.is_hollow else faces
     vertices, corners = faces.vertices - middle_of(one), faces.corners
@@ -118,27 +113,26 @@ def placed_sheets(scene: Scene) -> list[PlacedSheet]:
 
 
 LENGTH = 4.0
-"""Length of the shortest mirroring face [support radii]."""
+"""Length of the shortest face that mirrors the fluid [support radii]."""
 ON = 1e-6
-"""Greatest distance from a face at which a point counts as on the face [spacings]."""
+"""Tolerance for points on a face [spacings]."""
 
 
 @dataclass(frozen=True)
 class FlatFaces:
-    """Flat faces of moving solids that mirror the fluid, in the frames of the solids."""
+    """Flat faces of moving solids that mirror the fluid."""
 
     solids: Numbers
-    """(f,) numbers of the faces' solids"""
+    """Number of the solid of each face (f,)."""
     places: Points
-    """(f, 3) middles of the faces [m]"""
+    """Middles of faces in the solids' frames (f, 3) [m]."""
     frames: Points
-    """(f, 3, 3) rows: the normal towards the fluid and two unit vectors along the face"""
+    """Matrices (f, 3, 3) with rows of unit vectors: the normal towards the fluid, and two vectors along the face."""
     sizes: Points
-    """(f, 3) 0, and half lengths along these two vectors [m]"""
+    """Half lengths of faces along the rows of `frames` (f, 3) [m]; 0 along the normal."""
 
     def behind(self, solid: Numbers, positions: Points, feet: Points, near: float) -> Numbers:
-        """Return for wall particles (b,) the number of the face that each is behind, or -1; ``near`` [m] is the
-        tolerance."""
+        """Return the number of the face above each wall particle (b,), or -1. ``near`` [m] is a tolerance."""
         found = np.full(len(solid), -1)
         for number, (own, place, frame, size) in enumerate(
             zip(self.solids, self.places, self.frames, self.sizes, strict=True)
@@ -152,9 +146,11 @@ class FlatFaces:
 
 
 def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
-    """Find up to ``most`` mirroring faces of a scene with a ``support`` radius [m]: long edges of plane boxes and
-    polygons, and sides of boxes in space. The faces' solids have prescribed paths, and fluid slips along them. Only
-    scenes of the projection without periods have mirroring faces."""
+    """Return up to ``most`` faces of moving solids that mirror the fluid. ``support`` is the support radius [m].
+
+    Only scenes with the projection and without periodic axes have mirroring faces. They are long edges of 2-D boxes and
+    polygons, and sides of 3-D boxes, of solids with a prescribed path and free slip.
+    """
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):
         for number, table in enumerate(moving(scene.solid)):
@@ -167,7 +163,6 @@ def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
 
 
 def _edges(solid: Solid, spacing: float) -> Iterator[tuple[Points, Points, Points]]:
-    """Yield middle, frame and half size of each edge of a plane solid, as in `FlatFaces`."""
     faces = solid.faces(spacing)
     for start, end in faces.vertices[faces.corners]:
         length = float(np.linalg.norm(end - start))
@@ -177,7 +172,6 @@ def _edges(solid: Solid, spacing: float) -> Iterator[tuple[Points, Points, Point
 
 
 def _sides(solid: Solid) -> Iterator[tuple[Points, Points, Points]]:
-    """Yield middle, frame and half size of the six sides of a box in space; nothing for other solids."""
     box, outwards = (solid.cavity, -1.0) if isinstance(solid, Hollow) else (solid, 1.0)
     if isinstance(box, Box):
         for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
@@ -198,7 +192,8 @@ def nozzles_of(scene: Scene, discrete: DiscreteScene) -> list[Nozzle]:
 
 
 def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> Drained | None:
-    """Return the drains of a scene, or None; raise `InputError` if removed particles would lie beyond the precision."""
+    """Return the drains of a scene, or None. Raise `InputError` if the resting positions of removed particles are too
+    far away for the precision."""
     if not scene.drain:
         return None
     fluid, d, spacing = discrete.fluid, scene.dimension, scene.discretisation.spacing

@@ -1,4 +1,4 @@
-"""Tangent and adjoint of the base of solvers of particles; a solver adds the derivatives of its loops."""
+"""Tangent and adjoint of the base class of particle solvers."""
 
 from functools import partial
 from weakref import finalize
@@ -24,7 +24,7 @@ class ParticleTangent:
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         kick = solver.kick_of(self.carried_dot)
         self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
-        """Tangents of the parameters, and after `sort` of sorted particles."""
+        """Tangents of the parameters and of sorted particles."""
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         finalize(self, solver.launch.forget)
@@ -47,7 +47,7 @@ class ParticleTangent:
         return self._accelerations_dot[-1]
 
     def predict(self, context: StepContext, v_star: wp.array, x_star_dot: wp.array, v_star_dot: wp.array) -> None:
-        """Write v* = v + dt a, and the tangents of v* and of x* = x + dt v*."""
+        """Write the predicted velocities, and the tangents of the predicted velocities and positions."""
         accelerations = {"acceleration": self._solver.accelerations[-1], "acceleration_dot": self.accelerate(context)}
         out = {"v_star": v_star, "x_star_dot": x_star_dot, "v_star_dot": v_star_dot}
         context.launch(self._solver.integration.predict_tangent, *self.dot.named, **accelerations, **out)
@@ -64,7 +64,7 @@ class ParticleTangent:
 
 
 class ParticleAdjoint:
-    """The adjoint of steps, part by part in reverse order; sums over neighbours are gathers without atomics."""
+    """The adjoint of a step. It applies the adjoints of the step's parts in reverse order."""
 
     def __init__(self, solver: ParticleSolver, steps: int):
         layout = solver.layout
@@ -81,9 +81,9 @@ class ParticleAdjoint:
             SolidShares(solver.search.moving, layout),
             [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies],
         )
-        """Adjoints; adjoints of parameters are complete after `collect`."""
+        """Adjoints of a step. Call `collect` for the adjoints of parameters."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
-        """Adjoints of the carried fields, valid after `unsort`."""
+        """Adjoints of the solver's state fields, after `unsort`."""
         self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()
         self._collect = CapturedGraph(partial(self.bar.shares.collect, self.bar.parameters), solver.launch)
         finalize(self, solver.launch.forget)
@@ -99,8 +99,8 @@ class ParticleAdjoint:
         return self.bar.parameters
 
     def unsort(self, context: StepContext, state_bar: State) -> State:
-        """Apply the adjoint of `ParticleSolver.unsort`: return adjoints of positions and velocities before parts
-        prescribe values, in the scene's order."""
+        """Apply the adjoint of `ParticleSolver.unsort`. Return the adjoints of positions and velocities in scene order,
+        before emitters and other parts prescribe values."""
         self.carried_bar.sort(context, state_bar)
         free_bar = state_bar
         for part in self._parts:
@@ -108,14 +108,12 @@ class ParticleAdjoint:
         return free_bar
 
     def begin_step(self, context: StepContext, free_bar: State, v_star: wp.array) -> None:
-        """Write the adjoints of the fields of a step that ends with x' = x + dt ``v_star``, given the result of
-        `unsort`; earlier values are overwritten."""
+        """Write the adjoints of a step's final velocities and positions, given the result of `unsort`."""
         scene = {"x_scene_bar": free_bar.positions, "v_scene_bar": free_bar.velocities}
         context.launch(self._solver.integration.begin_adjoint, *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
-        """Apply the adjoints of v* = v + dt a and of `accelerate`, from the adjoint of velocities; add adjoints
-        ``within`` the step."""
+        """Apply the adjoint of the velocity prediction and of the forces. Add the adjoints ``within`` the step."""
         fields = self.bar.fields
         if within is not None:
             add(within.v_star, fields["v"])
@@ -132,12 +130,12 @@ class ParticleAdjoint:
             acceleration_bar = acceleration_bar if passed is None else passed
 
     def mix(self, context: StepContext, state_bar: State) -> None:
-        """Apply the adjoint of the sorting of parts' fields in `ParticleSolver.sort`."""
+        """Apply the adjoint of sorting the fields of parts."""
         for part in self._parts:
             part.sort(context, self.bar, state_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """Apply the adjoint of `ParticleSolver.sort`, except the sorting of parts' fields."""
+        """Apply the adjoint of sorting the particles."""
         solver, b = self._solver, self.bar.fields
         self.density.measure(context, self.bar)
         with context.aside():

@@ -1,4 +1,4 @@
-"""The base of solvers of particles: everything in a step except the loops that make the fluid incompressible."""
+"""The base class of particle solvers: everything in a step except the pressure iterations."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from cortado.sph.parts import Carried, Force, Part, PartMaker, StepContext, inte
 
 @dataclass(frozen=True)
 class ParticleSystem:
-    """A scene discretised into particles on a device; `cortado.solvers.build.particle_system` makes it."""
+    """A scene discretised into particles on a device."""
 
     called: str
     discretisation: Discretisation
@@ -39,37 +39,37 @@ class ParticleSystem:
     search: NeighbourSearch
     forces: Sequence[Force]
     periods: Sequence[float]
-    """(3,) [m], 0 along an axis that is not periodic."""
+    """Lengths of the periodic box (3,) [m]; 0 along an axis that is not periodic."""
     parts: Sequence[PartMaker]
     waiting: int
-    """Number of the first particle that may wait in a nozzle or be removed by a drain."""
+    """Index of the first particle that an emitter or a drain may move."""
     walled: Walled
     mirrors: tuple[Points, Points]
-    """Coordinates of the flat walls that mirror the fluid, (3,) at lower and at upper ends [m]; infinite at ends
-    without a mirror."""
+    """Coordinates of flat walls that mirror the fluid: lower walls (3,) and upper walls (3,) [m]; infinite without a
+    wall."""
     faces: FlatFaces
     solids: Mapping[str, NamedSolid]
     sheets: Sheets | None
-    """Walls of no thickness; None without any."""
+    """Sheets, which are walls without thickness, or None."""
     of_one_lane: Callable[[], "ParticleSystem"]
-    """Makes a system with the same neighbour search and with kernels for Warp's tape."""
+    """Function that makes a system with kernels for ``warp.Tape``."""
 
 
 class ParticleSolver(Staying):
-    """The base of solvers of one set of particles on one device; every step reuses its arrays.
+    """The base class of particle solvers. Every step reuses the same arrays.
 
-    `Solver` documents the methods of its protocol. A subclass defines `step`, `replay` and `write_state`, with loops
-        also `reserve`, and if it has derivatives also `tangent`, `adjoint` and `differentiable`.
+    `Solver` documents the methods. A subclass defines `step`, `replay` and `write_state`. A subclass with loops also
+    defines `reserve`, and a subclass with derivatives `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
-    """Fields of particles that the solver carries from step to step."""
+    """Fields of particles that the solver needs in the next step."""
     topic = "density"
-    """Topic of the Warp modules with the kernels of the density."""
+    """Part of the names of Warp modules."""
     density_power = 2
-    """The k in p_i / n_i^k, the factor in a pair's pressure force, with the number density n_i."""
+    """Exponent of the number density, by which the pressure force divides the pressure."""
     shares: tuple[str, ...] = ()
-    """Parameters of the solver to whose adjoints every particle adds a term; see `Force.shares`."""
+    """Parameters of the solver with adjoints that are sums over particles."""
 
     def __init__(self, system: ParticleSystem, requires_grad: bool = False):
         discretisation, search, layout = system.discretisation, system.search, system.layout
@@ -88,7 +88,6 @@ class ParticleSolver(Staying):
         self.free = [body for part in self.parts if isinstance(part, FreeSolidsPart) for body in part.bodies]
         self.substeps = 0
         self.carried = Carried(self.carried_fields, layout, requires_grad)
-        """The carried fields of sorted particles at the start of the step."""
         of_parts = (field for part in self.parts for field in part.fields)
         self.state_fields = (POSITIONS, VELOCITIES, *of_parts, *self.carried_fields)
         check_fields(self.state_fields, layout.known)
@@ -98,7 +97,7 @@ class ParticleSolver(Staying):
         if layout.phases == 1:
             self.fractions.fill_(1.0)
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
-        """``accelerations[t]`` is the sum over the first t forces; ``accelerations[0]`` is 0 and never written."""
+        """Partial sums of accelerations: entry t is the sum over the first t forces."""
         self.loops: tuple[Loop, ...] = ()
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
@@ -111,30 +110,25 @@ class ParticleSolver(Staying):
         return Density(self.discretisation, self.topic)
 
     def wall_push(self) -> WallAction:
-        """Return the sums over walls that, multiplied by V^2 p_i / n_i^`density_power`, are a particle's force on
-        walls."""
+        """Return the sums over walls from which the pressure force on walls is computed."""
         return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def image_loads(self) -> Any:
-        """Return additional forces on mirroring walls, `cortado.solvers.projection.mean_stress.ImageLoads`; None if no
-        wall mirrors."""
+        """Return additional forces on mirroring walls, or None without mirroring walls."""
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return from ``carried`` the velocity change by the previous step's pressure, its tangent or its adjoint; None
-        without this field."""
+        """Return the velocity change by the pressure of the last step, or its tangent or adjoint. Return None if the
+        solver does not store the velocity change."""
         return None
 
     def vectors(self) -> wp.array:
-        """Make an array (n,) of zero vectors."""
         return self._array(self.discretisation.precision.vector)
 
     def numbers(self) -> wp.array:
-        """Make an array (n,) of zeros."""
         return self._array(self.discretisation.precision.real)
 
     def new_fractions(self) -> wp.array:
-        """Make an array (n,) of zero vectors with an entry for each phase."""
         return self._array(self.discretisation.precision.fractions(self.layout.phases))
 
     def _array(self, dtype: Any) -> wp.array:
@@ -181,7 +175,7 @@ class ParticleSolver(Staying):
             wp.copy(own.rounds, given.rounds)
 
     def reserve(self, counts: Counts) -> None:
-        """Do nothing: a step without loops has no iterates."""
+        """Do nothing: without iterations no arrays are needed."""
 
     def reset(self, step: int = 0) -> None:
         for loop in self.loops:
@@ -201,8 +195,7 @@ class ParticleSolver(Staying):
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:
-        """Begin a step: sort particles, list neighbours, compute the density and begin the parts. Nothing later in the
-        step reads the state."""
+        """Begin a step: sort the particles, list their neighbours and compute densities."""
         context = self.context(parameters)
         for part in self.parts:
             part.begin(context, state)
@@ -223,14 +216,13 @@ class ParticleSolver(Staying):
         return context
 
     def accelerate(self, context: StepContext) -> wp.array:
-        """Return the accelerations (n,) by all explicit forces [m / s2], vectors of sorted particles."""
+        """Return the accelerations of sorted particles by all explicit forces (n,) [m / s2]."""
         for t, force in enumerate(self.forces):
             force.accelerate(context, self.accelerations[t], self.accelerations[t + 1])
         return self.accelerations[-1]
 
     def unsort(self, context: StepContext, x: wp.array, v: wp.array, new_state: State, **carried: wp.array) -> None:
-        """Write the new state from sorted positions, velocities and ``carried`` fields; then let parts write the values
-        that they prescribe."""
+        """Write the new state from positions, velocities and ``carried`` fields of sorted particles."""
         free, ends = new_state, []
         for part in reversed(self.parts):
             ends.append((part, free))
@@ -241,8 +233,8 @@ class ParticleSolver(Staying):
             part.end(context, new_state, moved)
 
     def end_step(self, x: wp.array, v: wp.array, new_state: State, log: IterationLog) -> None:
-        """Look for lost particles, record the loops, and count the step; ``x`` and ``v`` are sorted, before a nozzle
-        prescribes values."""
+        """Find lost particles, record the loops, and count the step. ``x`` and ``v`` are positions and velocities of
+        sorted particles."""
         f, containment = self.fields, self.containment
         containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
         for solve in log.solves:
@@ -255,8 +247,11 @@ class ParticleSolver(Staying):
             self.launch(count_step, bad, step=self.step_number, threads=self.layout.members)
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """Return densities (n,) [kg / m3] of a state in the scene's order; in a batch the scenes are concatenated.
-        Solids have the poses at the end of ``step``, counted from 0. The solver's arrays are overwritten."""
+        """Return the densities (n,) [kg / m3] of a state in scene order. A batch returns the scenes one after the
+        other.
+
+        Moving solids are at their poses at the end of step ``step``. The call overwrites the arrays of the solver.
+        """
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():
@@ -264,16 +259,15 @@ class ParticleSolver(Staying):
         return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
 
     def pressures(self) -> wp.array | None:
-        """Return the pressures (n,) [Pa] with which sorted particles push walls in the last step, which must not be a
-        replayed one; None without pressures."""
+        """Return the pressures (n,) [Pa] of sorted particles on walls in the last step, or None without pressure."""
         return None
 
     def stresses(self) -> wp.array | None:
-        """Return the pressures (n,) that a gauge reads at sorted particles [Pa]."""
+        """Return the pressures (n,) [Pa] of sorted particles for pressure sensors."""
         return self.pressures()
 
     def in_scene_order(self, values: NDArray) -> NDArray:
-        """Return values (n,) of sorted particles in the scene's order; in a batch the scenes are concatenated."""
+        """Return values (n,) of sorted particles in scene order. A batch returns the scenes one after the other."""
         found = np.empty(self.layout.all_particles)
         found[self.search.order.numpy()[: len(found)]] = values
         return found

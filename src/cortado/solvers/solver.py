@@ -1,6 +1,6 @@
-"""The protocol of a solver, which takes steps, replays a step, and computes its tangent and its adjoint.
+"""The protocol of a solver: steps, repeated steps, tangents and adjoints.
 
-Rollouts, gradients, the certificate, files and reports of runs use a solver only through this protocol.
+Rollouts, gradients, files and reports of runs use a solver only through this protocol.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,89 +18,93 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext, Tangents
 
 Counts = tuple[int, ...]
-"""Numbers of iterations of each loop of a step, with which the step can be replayed bit for bit."""
+"""Numbers of iterations of each loop in a step. A step with given numbers can be repeated exactly."""
 
 
 class StepLog(Protocol):
-    """Diagnostics of each step of a run, on the device until they are read."""
+    """Protocol of a log with the diagnostics of each step. The numbers stay on the device until `read` is called."""
 
     @property
     def diagnostics(self) -> Mapping[str, NDArray]:
-        """Return diagnostics by name, (steps,) or in a batch (steps, batch), of the steps that were read. Every solver
-        has ``converged``. PCISPH also has ``iterations``, ``density_errors``, the average of the compressions (rho* -
-        rho_0)+ / rho_0, and ``greatest_density_errors``; the projection also has ``divergence``. Reports plot
-        ``density_errors``, and take integer diagnostics for iterations of loops."""
+        """Return the diagnostics of the steps up to the last `read`, by name: (steps,), or (steps, batch) for a batch.
+
+        Every solver has ``converged``. PCISPH also has ``iterations``, ``density_errors`` and
+        ``greatest_density_errors``. The two errors are the mean and the maximum of the particles' relative compression.
+        The projection also has ``divergence``. Reports plot ``density_errors``, and treat integer diagnostics as
+        numbers of iterations.
+        """
 
     def read(self, steps: int) -> None:
         """Read the diagnostics of the first ``steps`` steps from the device."""
 
     def assign(self, other: Self) -> None:
-        """Copy the diagnostics of another log of the same solver and length."""
+        """Copy the diagnostics from a log of the same solver and length."""
 
     def seek(self, step: int) -> Counts:
-        """Return the iterations of a step of the run, counted from 0, and prepare the solver's loops to repeat the
-        step. In a batch the scene with the most iterations sets the numbers."""
+        """Return the numbers of iterations of step ``step``, and prepare the solver's loops to repeat the step. For a
+        batch, return the greatest numbers over all scenes."""
 
 
 class StepTangent(Protocol):
-    """The tangent of steps that a solver has replayed, along tangents of the parameters (forward mode)."""
+    """Protocol of the tangent of a repeated step (forward mode)."""
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
-        """Replace the tangent of the replayed step's state by the tangent of the step's result."""
+        """Update ``state_dot`` from the tangent before the repeated step to the tangent after the step."""
 
 
 class StepAdjoint(Protocol):
-    """The adjoint of steps that a solver has replayed (reverse mode)."""
+    """Protocol of the adjoint of a repeated step (reverse mode)."""
 
     def begin(self) -> None:
-        """Set the adjoints of the parameters to 0, before a backward pass."""
+        """Set the adjoints of the parameters to 0."""
 
     def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Replace the adjoint of the replayed step's result by the adjoint of the step's state."""
+        """Update ``state_bar`` from the adjoint after the repeated step to the adjoint before the step."""
 
     def collect(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""
 
 
 class PressureTangent(StepTangent, Protocol):
-    """The tangent of a solver with pressures."""
+    """Protocol of the tangent of a solver with pressures."""
 
     dot: Tangents
 
     def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Return tangents (n,) of the pressures of sorted particles on walls in the last step [Pa]; ``rounds`` has the
-        iterations of the step's first loop in each scene."""
+        """Return the tangents (n,) of the pressures of sorted particles on walls in the last step [Pa]. ``rounds`` are
+        the numbers of pressure iterations of the scenes."""
 
     def stresses(self, rounds: Sequence[int]) -> NDArray:
-        """Return tangents (n,) of the pressures that a gauge reads at sorted particles [Pa]."""
+        """Return the tangents (n,) of the pressures of sorted particles for pressure sensors [Pa]."""
 
 
 @dataclass(frozen=True)
 class WithinBar:
-    """Adjoints of sorted particles' quantities within a step."""
+    """Adjoints of intermediate quantities of sorted particles in a step."""
 
     fields: Fields
-    """Adjoints of the fields at the start of the step."""
     p: wp.array
-    """(n,) adjoint of the pressures of particles on walls."""
+    """Adjoint of the pressures of particles on walls (n,)."""
     stress: wp.array | None
-    """(n,) adjoint of the pressures that a gauge reads; None without such an adjoint."""
+    """Adjoint of the pressures for pressure sensors (n,), or None."""
     v_star: wp.array
-    """(n,) adjoint of v* = v + dt a by explicit forces, without the dependence of v* on dt."""
+    """Adjoint of the velocities after explicit forces (n,)."""
 
 
 class PressureAdjoint(StepAdjoint, Protocol):
-    """The adjoint of a solver with pressures."""
+    """Protocol of the adjoint of a solver with pressures."""
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write to ``state_bar`` the adjoint of the replayed step's state, given adjoints ``within`` the step and a
-        zero adjoint of its result."""
+        """Write to ``state_bar`` the adjoint of the state before the repeated step, given the adjoints ``within`` the
+        step."""
 
 
 class Solver(Protocol):
-    """The solver of a scene, or of a batch of scenes, on one device; rollouts share it. Only the methods `make_room`
-    and `reset` wait for the device. A solver without a derivative raises `InputError` from `tangent`, `adjoint` or
-    `differentiable`."""
+    """Protocol of the solver of a scene or of a batch, on one device. Several rollouts may share a solver.
+
+    Only the methods `make_room` and `reset` wait for the device. A solver without derivatives raises `InputError` from
+    `tangent`, `adjoint` and `differentiable`.
+    """
 
     discretisation: Discretisation
     layout: Layout
@@ -109,57 +113,59 @@ class Solver(Protocol):
     turn: Turn
     containment: Containment
     step_number: wp.array
-    """(members,) number of the next step, which `step` increments; equal in all scenes of a batch."""
+    """Number of the next step in each scene (members,)."""
     generation: int
-    """Number of replacements of arrays or launches; graphs captured before the last replacement are stale."""
+    """Number of times that arrays or launches were replaced. A replacement makes captured CUDA graphs invalid."""
 
     def new_state(self, requires_grad: bool = False) -> State:
-        """Make a state of this solver's particles, all 0."""
+        """Make a state of this solver's particles with the value 0 everywhere."""
 
     def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
-        """Make the parameters of a run of ``steps`` steps, all 0."""
+        """Make the parameters of a run of ``steps`` steps with the value 0 everywhere."""
 
     def new_log(self, steps: int) -> StepLog:
         """Make a log with room for ``steps`` steps."""
 
     def set_substeps(self, substeps: int) -> None:
-        """Set the number of explicit substeps of diffusion in each step."""
+        """Set the number of explicit diffusion substeps in each step."""
 
     def reset(self, step: int = 0) -> None:
-        """Prepare to take a step; forget the counts and flags from that step on."""
+        """Prepare to take step ``step``, and forget all records of this step and later steps."""
 
     def make_room(self) -> bool:
-        """Lengthen neighbour lists that were too short. If the result is True, repeat the steps that used the lists."""
+        """Lengthen neighbour lists that were too short. Return True if steps must be repeated because of short
+        lists."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
-        """Take one step, and record it in a log of `new_log`; the two states may be one object."""
+        """Take one step, and record it in a ``log`` from `new_log`. ``state`` and ``new_state`` may be the
+        same object."""
 
     def reserve(self, counts: Counts) -> None:
-        """Make room for all intermediate values of a step."""
+        """Allocate arrays for the intermediate values of a step with these numbers of iterations."""
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
-        """Take a step again, bit for bit, and keep every intermediate value."""
+        """Repeat a step exactly (bit for bit), and store every intermediate value."""
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """Write the result of the step that was replayed."""
+        """Write the result of the repeated step."""
 
     def context(self, parameters: Parameters) -> StepContext:
-        """Return the context of the present step, which its parts read."""
+        """Return the context of the current step."""
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
-        """Return the tangent of steps along tangents of the parameters (forward mode)."""
+        """Return the tangent of a step (forward mode), given tangents of the parameters."""
 
     def adjoint(self, steps: int) -> StepAdjoint:
-        """Return the adjoint of the steps of a run of ``steps`` steps (reverse mode)."""
+        """Return the adjoint of a step (reverse mode), for a run of ``steps`` steps."""
 
     def differentiable(self) -> Self:
-        """Return a copy of this solver with arrays that Warp's tape can differentiate."""
+        """Return a copy of this solver with arrays that ``warp.Tape`` can differentiate."""
 
     def match(self, other: Self) -> None:
-        """Copy the capacities and the number of substeps of another solver, which differs only in its arrays."""
+        """Copy the capacities and the number of substeps from a solver of the same kind."""
 
     def follow(self, other: Self) -> None:
-        """Prepare to replay the step that another solver is ready to replay; only the arrays of both solvers differ."""
+        """Prepare to repeat the same step as the solver ``other``, which is of the same kind."""
 
     def gradient_memory(self, log: Any) -> Mapping[str, float]:
-        """Return the memory [bytes] that reverse mode through the steps of a log needs, by purpose."""
+        """Return the memory [bytes] that reverse mode needs for the steps of a log, by purpose."""

@@ -1,4 +1,4 @@
-"""The physical terms of a step, each with its kernels, their launches and the parameters that it depends on."""
+"""The physical terms of a step, each with its kernels and parameters."""
 
 from typing import TYPE_CHECKING
 

@@ -1,5 +1,5 @@
-"""Surface tension by curvature: a force across the surface (continuum surface force, Brackbill et al. 1992) with
-smoothed normals and a corrected curvature (Morris 2000; Zorilla et al. 2020).
+"""Surface tension by curvature, as a force across the surface (continuum surface force, Brackbill et al. 1992). Normals
+are smoothed, and the curvature is corrected (Morris 2000; Zorilla et al. 2020).
 
 With g_ij = V grad W_ij, sums over the fluid and the particle itself, the spacing s, and a smoothstep S(a, b) from a to
 b:
@@ -16,13 +16,14 @@ the surface and 0 inside; e is the normal. D B^-1 is the gradient of normals, ex
 delta). J is the sum of w |q| over the layers of a flat surface, the mean of two cut lattices. The trace needs only the
 symmetric part of D.
 
-The constants in delta, in spacings, were fitted on discs and balls of concentric rings and shells, and hold within 0.05
-for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth `DEEP`, and the
-sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop would be (d - 1) sigma
-/ R. A wave of the surface moves less at the depth `ACTS` where the force acts: the squared frequency of mode n would be
-too small by n ACTS / R in the plane and (n + 1) ACTS / R in space. Subtracting ACTS d / (3 (d - 1)) from delta makes
-the errors of pressure and of the squared frequency of mode 2 equal and opposite: 0.5 / R in the plane and 0.75 / R in
-space.
+The constants in delta, in spacings, were fitted to discs and balls of concentric rings and shells. They hold within
+0.05 for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth `DEEP`, and
+the sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop would be (d - 1)
+sigma / R.
+
+A wave of the surface moves less at the depth `ACTS` where the force acts. The squared frequency of mode n would be too
+small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. Subtracting ACTS d / (3 (d - 1)) from delta makes the errors of
+pressure and of the squared frequency of mode 2 equal and opposite: 0.5 / R in 2-D and 0.75 / R in 3-D.
 """
 
 from dataclasses import dataclass
@@ -42,21 +43,21 @@ from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 
 DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
-"""In spacings, see the module."""
+"""Lengths that determine the depth of the force [spacings]: depth of the computed curvature, excess of the force on
+curved surfaces, and depth where the force acts."""
 
 
 @dataclass(frozen=True)
 class CurvatureConstants:
     spacing: float
-    """[m]"""
     width: float
-    """J [-]"""
+    """Sum of weighted normals over the layers of a flat surface [-]."""
     depth: float
-    """delta [m]"""
+    """Mean depth of the force below the surface [m]."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
-        """Compute the constants from a lattice with a spacing [m] and a support radius [m]."""
+        """Compute the constants for a lattice with this spacing [m] and support radius [m]."""
         width = float(np.mean([_width(kernel, support / spacing, dimension, cut) for cut in ((1, 0), (1, 1))]))
         shared = ACTS * dimension / (3.0 * (dimension - 1))
         return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))
@@ -64,7 +65,6 @@ class CurvatureConstants:
 
 @cache
 def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[int, int]) -> float:
-    """Return J of a surface cut across a direction in the plane of the first two axes, for a support in spacings."""
     offsets, volume = lattice_offsets(1.0, support, dimension), rest_volume(kernel, 1.0, support, dimension)
     apart = 1.0 / float(np.linalg.norm(cut))
     weights = volume * kernel.weight(np.linalg.norm(offsets, axis=1), dimension, support)
@@ -81,11 +81,11 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
 
 FAINT, CLEAR = 0.03, 0.1
 SINGULAR = {2: 1e-3, 3: 1e-4}
-"""By dimension, the number added to det B, so that kappa is 0 if neighbours lie on a line or are missing."""
+"""Regularisation of a determinant, for each dimension. The curvature is then 0 if neighbours lie on a line."""
 LONE = 1e-6
-"""Number added to sum V W w, so that the mean curvature is 0 without neighbours in the surface."""
+"""Regularisation of the sum of weights. The mean curvature is then 0 without neighbours in the surface."""
 HOLLOW = 0.25
-"""-delta kappa above which the divisor 1 + delta kappa falls by a parabola to a positive constant: in small bubbles."""
+"""Greatest curvature of a bubble, times the depth of the force, without smooth limitation."""
 
 
 @cache
@@ -105,8 +105,6 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
     @wp.func(module=module)
     def normal_work(q: vector, spacing: real, w_bar: real, e_bar: vector) -> real:
-        """Return w w_bar + e . e_bar, whose gradient is the adjoint of q. With w_bar = 0 the gradient is also the
-        change of e along e_bar, because de / dq is symmetric."""
         w, e = normal(q, spacing)
         return w * w_bar + wp.dot(e, e_bar)
 
@@ -135,12 +133,8 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
 @cache
 def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of the curvature's sums over the fluid, with derivatives. Symmetric matrices are
-    diagonals and entries yz, xz, xy.
-
-    ``colour``: g and z, without W(0). ``average``: V sum W_ij g_j. ``bend``: B and the symmetric part of D. ``mean``: V
-    sum W_ij c_j and V sum W_ij w_j.
-    """
+    """Make the Warp functions of the sums over the fluid, with derivatives. Symmetric matrices are stored as the
+    diagonal and the entries yz, xz and xy."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), precision.matrix
@@ -241,7 +235,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the particles' arrays; c is w kappa."""
+    """Return the Warp types of the particles' arrays by name."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}
@@ -249,8 +243,7 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels ``colour``, ``normal``, ``bend`` and ``mean`` in 2 or 3 dimensions, with derivatives. The
-    adjoint of ``mean`` is two kernels, the first without neighbours. ``depth`` is delta, ``per_width`` 1 / J."""
+    """Make the kernels ``colour``, ``normal``, ``bend`` and ``mean`` in 2 or 3 dimensions, with derivatives."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     matrix, sums, typed = precision.matrix, curvature_sums(discretisation), types_of(discretisation)
     moments = moment_functions(precision, dimension)

@@ -1,16 +1,14 @@
-"""Density by summation over fluid and wall particles of calibrated weights, as a number density:
+"""Density by summation over fluid and wall particles (Solenthaler and Pajarola 2008).
 
-n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib), rho_i = m_i n_i.
+The number density of particle i is
 
-V is the rest volume on the lattice and m_i a particle's mass over V. Masses of neighbours do not enter (Solenthaler and
-Pajarola 2008), so that the density of a heavy fluid does not smear into a light fluid.
+    n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib)
 
-For the pressure, walls act on a particle by the sums
+with the rest volume V of a particle, the smoothing kernel W, neighbours j, and wall particles b of weight w_b. The
+density is m_i n_i, where m_i is the mass of the particle divided by V. Masses of neighbours do not enter, so that the
+density of a heavy fluid does not smear into a light fluid.
 
-g_i = sum_b w_b G_ib, g_i' = sum_b w_b H_ib x_ib' + w_b' G_ib.
-
-A particle with pressure p_i pushes the walls around it with the force V^2 p_i / n_i^2 g_i. H is symmetric, so that the
-sum with H serves both forward and reverse mode.
+The pressure of a particle pushes walls along the sum of the walls' kernel gradients.
 """
 
 from functools import cache, cached_property, partial
@@ -31,8 +29,7 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @cache
 def density_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the sum of W over neighbours and padding entries, with derivatives. For an adjoint r
-    of every particle's sum, the adjoint of positions is sum_j (r_i + r_j) G_ij + sum_b w_b r_i G_ib."""
+    """Make the Warp functions of the sum of the kernel over neighbours, with derivatives."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, slope, gradient = pair.weight, pair.slope, pair.gradient
@@ -70,7 +67,7 @@ def _density_work(d: Discretisation) -> Any:
 
 @cache
 def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
-    """Make the kernels of the number density in the Warp modules of a topic, for example a solver's."""
+    """Make the kernels of the number density. ``topic`` is part of the names of Warp modules."""
     real, neighbourhood = discretisation.precision.real, neighbourhood_type(discretisation.precision)
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)
@@ -114,7 +111,7 @@ class DensityAdjoint:
         self._density = density
 
     def begin(self) -> None:
-        """Set adjoints of an earlier backward step to 0."""
+        """Set the adjoints to 0."""
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
         density = self._density
@@ -125,7 +122,7 @@ class DensityAdjoint:
 
 @cache
 def wall_slope_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of g, its ``tangent``, and ``change``, the sum over walls of H times ``along``."""
+    """Make the Warp functions of the sum of kernel gradients over walls, with derivatives."""
     _, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
@@ -159,22 +156,23 @@ def _work(d: Discretisation) -> Any:
 
 
 class WallAction(Protocol):
-    """The action of walls on the particles around them by one term of a step, read after the step. ``solid`` is a
-    solid's number, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """Protocol of the action of walls on particles by one force, which is read after a step. ``solid`` is the number of
+    a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return the action (n,) of walls on sorted particles, vectors; for a force accelerations [m / s2]."""
+        """Return the action of walls on sorted particles, (n,) vectors. For a force, these are accelerations
+        [m / s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        """Return the tangents (n,) of the action, after forward mode of the step."""
+        """Return the tangents of the action (n,). Forward mode of the step must be complete."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """Turn adjoints of the action into adjoints of sorted particles, parameters and solids, in ``bar``, and into
-        adjoints (n,) of v* = v + dt a, the velocities after all explicit forces."""
+        """Convert the adjoint ``total_bar`` of the action to adjoints of sorted particles, parameters and solids in
+        ``bar``. Add to ``v_star_bar`` (n,), the adjoint of the velocities after all explicit forces."""
 
 
 class WallSums:
-    """A `WallAction` that sums a `WallTerm` with two ``constants``; its arrays are those of the last step."""
+    """A `WallAction` that sums a `WallTerm`. Its arrays are from the last step."""
 
     def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
         self.term, self._layout, self._constants = term, layout, constants

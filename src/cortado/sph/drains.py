@@ -1,19 +1,20 @@
 """Drains, which remove particles that enter them, and sinks, to which fluid flows at a given flow rate.
 
-A particle inside a drain at the start of a step is removed: from the end of the step on it rests far from all others,
-with the number of the drain as ``drained``. The removal has no derivative.
+A particle inside a drain at the start of a step is removed. From the end of the step on it rests far from all others,
+and its field ``drained`` is the number of the drain. The removal has no derivative.
 
 A sink makes fluid flow to its middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions:
 
     v* = (1 - phi) (v + dt a) + phi (u - lambda w),   u = -Q y / (S r^d),
 
-instead of v + dt a. S is the part of the unit sphere or circle that walls leave open; phi rises smoothly from 0 at r_2
+instead of v + dt a. S is the part of the unit sphere or circle that walls leave open. phi rises smoothly from 0 at r_2
 to 1 at r_1. Particles within r_0 < r_1 are removed, so that a removed particle has neighbours with prescribed motion.
-The velocity change w by pressure in the previous step is damped by lambda < 1; without w, pressure would press fluid
+The velocity change w by pressure in the previous step is damped by lambda < 1. Without w, pressure would press fluid
 through the shell from r_0 to r_1.
 
-Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. E is the rounded number of particles
-that the sink is behind, at most M / 4 either way, and M the number of particles within r_1. E has no derivative.
+Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. M is the number of particles within
+r_1. E is the rounded number of particles that the sink should have removed but has not, from -M / 4 to M / 4. E has no
+derivative.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,15 +39,15 @@ from cortado.sph.emitter import Nozzle, nozzle_type, remaining_function
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 MEMORY = 0.98
-"""lambda."""
+"""Subtracted fraction of the velocity change by the pressure of the previous step."""
 BOX, PLANE, BALL = 0, 1, 2
 MOST = 0.25
 DRAINED = StateField("drained", "", Entry.NUMBER)
-"""Number, from 1 on, of the drain that removed a particle; 0 for particles in the fluid."""
+"""Number, from 1, of the drain that removed a particle; 0 for all other particles."""
 
 
 def behind(name: str) -> StateField:
-    """Return the field of the number of particles that a sink is behind, which is not rounded."""
+    """Return the field for the number of particles that a sink should have removed but has not."""
     return StateField(f"{name}.behind", "", Entry.DOUBLE, Axis.SCALAR)
 
 
@@ -55,40 +56,38 @@ class Mouth:
     name: str
     shape: int
     middle: Points
-    """(d,) [m]"""
     ends: Points
-    """(2, d) corners of a box from its middle [m], which may be infinite; the direction of a plane, twice."""
+    """Corners of a box relative to its middle (2, d) [m], or twice the direction of a plane."""
     radius: float = 0.0
-    """[m]"""
 
 
 @dataclass(frozen=True)
 class Pull:
     shell: tuple[float, float]
-    """r_1 and r_2 [m]"""
+    """Inner and outer radius of the transition between prescribed and free flow [m]."""
     sphere: float
-    """S"""
+    """Open solid angle around the sink [sr], in 2-D angle [rad]."""
     holds: float
-    """M"""
+    """Number of particles with prescribed flow."""
 
 
 @dataclass(frozen=True)
 class Drained:
-    """The drains of a scene, the places of removed particles, and the nozzles, whose particles are not removed."""
+    """The drains of a scene, and resting positions for removed particles."""
 
     mouths: Sequence[Mouth]
     pulls: Mapping[str, Pull]
     places: Points
-    """(n, d) [m]"""
+    """Resting positions of removed particles (n, d) [m]."""
     nozzles: Sequence[Nozzle]
     periods: Points
-    """(d,) [m], 0 along an axis that is not periodic"""
+    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
 
 
 @cache
 def mouth_type(precision: Precision) -> Any:
-    """Return the Warp struct of a drain: ``lower`` and ``upper`` are corners of a box from its middle [m], ``lower`` is
-    the direction of a plane; ``period`` [m] and its inverse ``frequency`` are 0 along an axis that is not periodic."""
+    """Return the Warp struct of a drain. ``lower`` and ``upper`` are corners of a box relative to its middle [m];
+    ``lower`` may also be the direction of a plane. ``period`` are the lengths of the periodic box [m]."""
     real, vector = precision.real, precision.vector
     ends, periods = {"lower": vector, "upper": vector}, {"period": vector, "frequency": vector}
     return struct_of("MouthOf", precision, shape=wp.int32, number=real, **ends, radius=real, **periods)
@@ -178,9 +177,8 @@ def _mouth(one: Mouth, number: int, periods: Points, precision: Precision) -> An
 
 @cache
 def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, Kernels]:
-    """Make the kernels that count removed particles, count how many a sink is behind, compute the acceleration by a
-    sink after all other forces, and read a sink's flow rate. The kernels except that of the acceleration have a thread
-    for each scene."""
+    """Make the kernels of sinks: for counting removed particles, for missing removals, for the acceleration, and for
+    the flow rate."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
     modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
@@ -219,7 +217,7 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
     @wp.kernel(module=modules[0], enable_backward=False)
     @of_scene.arrays
     def fall_behind(step, table: rows, time_step, taken_sum, cell: real, holds: real, behind, gain):
-        """Add due and subtract removed particles; ``gain`` is the factor 1 + E / M of the flow rate before."""
+        """Update ``behind``, the number of particles that the sink should have removed but has not."""
         m = wp.tid()
         held = wp.float64(holds)
         gain[m] = real(wp.float64(1.0) + wp.round(behind[m]) / held)
@@ -258,7 +256,7 @@ class DrainsAdjoint(PartAdjoint):
 
 
 class Drains(Part):
-    """The part of a step that removes particles, and the force of sinks, after all other forces."""
+    """The part of a step that removes particles, and the force of sinks, which is the last force of a step."""
 
     batches = is_last = True
     derivatives = DrainsTangent, DrainsAdjoint
@@ -272,7 +270,8 @@ class Drains(Part):
         counts = (StateField(count_name(one.name), "", Entry.DOUBLE, Axis.SCALAR) for one in of.mouths)
         self.fields = (DRAINED, *map(behind, of.pulls), *counts)
         self.taken = layout.arrays(taken=real, fresh=real, waits=real)
-        """(n,) number of the drain that removed a particle; 1 if the last drain did; 1 if it waits in a nozzle."""
+        """Three arrays (n,): number of the drain that removed a particle, 1 for particles of the last drain, and 1 for
+        particles that wait in an emitter."""
         self.places = to_device(of.places, precision, device)
         self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
         self._never = layout.arrays(serial=wp.float64)["serial"]

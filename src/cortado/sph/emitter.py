@@ -1,13 +1,13 @@
-"""Fluid from a nozzle: the motion of particles is prescribed until they pass the nozzle's opening.
+"""Fluid from a nozzle: the motion of particles is prescribed until they pass the opening of the nozzle.
 
-A particle starts u upstream of the opening, o beside the axis. The particle is prescribed in steps n = 0, 1, ... while
-s = u - l > 0, where l grows by w dt in each step, w = Q / A:
+A particle starts at the distance u upstream of the opening, with the offset o from the axis. It is prescribed in steps
+n = 0, 1, ... while s = u - l > 0, where l grows by w dt in each step, with the speed w = Q / A:
 
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
-q_n is the position of the opening after step n (at rest before the first), e its direction, Q the flow rate in the step
-and A its area. Position and velocity do not jump when a particle becomes free. Particles further upstream than the
-column is long are in reserve: they rest at separate places, without derivative.
+q_n is the position of the opening after step n (at rest before the first), and e its direction. Q is the flow rate in
+the step, and A the area of the opening. Position and velocity do not jump when a particle becomes free. Particles
+further upstream than the column is long are in reserve: they rest at separate places, without derivative.
 
 A nozzle fed by drains emits removed particles again. When the column has room for a layer at its end, available
 particles join it, in line behind the first particles. The choice has no derivative.
@@ -31,8 +31,8 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
-    """Return the Warp struct of a nozzle: its particles, u as ``upstream``, o as ``offsets``, e as ``direction`` and A
-    as ``area``; lengths in m."""
+    """Return the Warp struct of an emitter: distances ``upstream``, ``offsets`` from the axis, ``direction`` and
+    ``area`` of the opening."""
     real, vector = precision.real, precision.vector
     particles = dict.fromkeys(("first", "count", "layer"), wp.int32)
     arrays = {"upstream": wp.array(dtype=real), "offsets": wp.array(dtype=vector)}
@@ -42,8 +42,8 @@ def nozzle_type(precision: Precision) -> Any:
 
 @cache
 def remaining_function(precision: Precision) -> Any:
-    """Make the Warp function of s [m], a particle's distance upstream of the opening; 0 or less for a particle that is
-    out, or not of the emitter. ``serial`` is the place in line, from 1 on, of a particle that is emitted again."""
+    """Make the Warp function of a particle's distance upstream of the opening [m]. It is 0 or less for free
+    particles."""
     real, nozzle_of = precision.real, nozzle_type(precision)
 
     @wp.func
@@ -60,9 +60,11 @@ def remaining_function(precision: Precision) -> Any:
 
 @cache
 def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels]:
-    """Make the kernels of the column's motion in a step, with a thread for each scene, and of the column's particles in
-    scene order. For each scene (members,) ``outlet`` is q_n [m], ``drift`` the velocity of prescribed particles [m/s],
-    and ``emitted`` l at the end of the step [m]. ``path`` and ``flow`` have a row for each step."""
+    """Make the kernels of the motion of the column and of its particles.
+
+    ``outlet`` (members,) is the position of the opening [m], and ``drift`` the velocity of waiting particles [m/s].
+    ``emitted`` is the length of the emitted column [m]. ``path`` and ``flow`` have a value for each step.
+    """
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
     module, derivatives = (integration_module(precision, *one, topic="emitter") for one in ((True, taped), (False,)))
     numbers, remaining = ["nozzle", "particles"], remaining_function(precision)
@@ -152,8 +154,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
 
 @cache
 def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
-    """Make the kernel that marks the particles in the drains of a nozzle, and the kernel that gives joining particles
-    their places in line. ``before`` counts the marked particles before each."""
+    """Make the kernels that mark removed particles and give them places in the queue of an emitter."""
     real, nozzle_of, remaining = precision.real, nozzle_type(precision), remaining_function(precision)
     module = integration_module(precision, True, taped, "emitter")
     numbers = {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "i member particles"}
@@ -184,19 +185,19 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Nozzle:
-    """The particles that wait in a nozzle, and its opening."""
+    """The opening of an emitter and its waiting particles."""
 
     name: str
     first: int
     sample: EmitterSample
     direction: np.ndarray
-    """(d,) unit vector of the flow"""
+    """Unit vector of the flow (d,)."""
     area: float
-    """Area of the opening [m2], in 2-D [m]."""
+    """Area of the opening [m2], in 2-D its width [m]."""
     places: np.ndarray
-    """(n, d) places of particles in reserve [m]"""
+    """Resting positions of particles in reserve (n, d) [m]."""
     feeding: np.ndarray
-    """(drains + 1,) true if the nozzle emits particles again that the drain with this number removed"""
+    """True for each drain that feeds the emitter (drains + 1,)."""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)
@@ -237,7 +238,7 @@ class EmitterAdjoint(PartAdjoint):
         self._sums = [part.layout.sum_of(part.layout.precision.vector) for _ in range(2)]
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Return the adjoint of free particles; add that of prescribed ones to ``bar`` and the nozzle's adjoint."""
+        """Return the adjoint of free particles. Add the adjoint of waiting particles to ``bar``."""
         emitter, free, prescribed = self.part, self._free, self._prescribed
         parts = {"x_free_bar": free.positions, "v_free_bar": free.velocities}
         parts |= {"x_prescribed_bar": prescribed.positions, "v_prescribed_bar": prescribed.velocities}
@@ -253,7 +254,7 @@ class EmitterAdjoint(PartAdjoint):
 
 
 class Emitter(Part):
-    """The part of a step that prescribes the particles waiting in a nozzle."""
+    """The part of a step that prescribes the motion of waiting particles in an emitter."""
 
     derivatives = EmitterTangent, EmitterAdjoint
 
@@ -286,7 +287,7 @@ class Emitter(Part):
         return {f"path{suffix}": parameters[path_name(name)], f"flow{suffix}": parameters[f"{name}.flow_rate"]}
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Compute the column's motion from the state before the step, which `end` may overwrite."""
+        """Compute the motion of the column from the state before the step."""
         name = self.nozzle.name
         before = {"q_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
         known = self.constants, self.parameters(step.parameters)

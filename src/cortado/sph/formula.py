@@ -1,10 +1,8 @@
-"""A user's Python function, compiled by Warp in either precision, with derivatives, and its parameters in kernels.
+"""User-defined Python functions in kernels, compiled by Warp in float32 or float64, with derivatives.
 
-Times, numbers and vectors are concatenated in one vector theta. Arrays, such as the weights of a network or a field on
-a grid, are concatenated in a table w (members, numbers). The value read for a particle is w_k + e w_dot_k with e = 0,
-so that the tangent along w_dot is the derivative with respect to e, which is treated as a number of the particle. The
-adjoint of w needs no atomics: each thread goes through every ROWS-th particle of a scene and adds to a separate row.
-The rows are summed in a fixed order.
+Numbers, vectors and times among the parameters of a function are stored in one vector. Arrays, such as the weights of a
+neural network, are stored in one table (members, numbers). The adjoint of the table needs no atomic operations: each
+thread adds to a separate row, and the rows are summed in a fixed order.
 """
 
 import ast
@@ -34,20 +32,20 @@ from cortado.sph.parts import Adjoints, StepContext
 
 WIDTH = (1, 3)
 MOST_NUMBERS = 2**24
-"""Greatest total size of a force's arrays: float32 represents every index up to it exactly."""
+"""Greatest total size of a force's arrays. float32 represents all indices up to this size exactly."""
 ROWS, MOST_PARTIAL = {"cpu": 16, "cuda": 2**15}, 2**24
 
 READ_AS = {"e": "_no", "member": "i // particles", "row": "_row"}
 
 
 def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
-    """Return the Warp vector type of parameters of these ranks, with at least one number."""
+    """Return the Warp vector type for parameters of these ranks."""
     return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
 
 
 @cache
 def table_type(precision: Precision) -> Any:
-    """Return the Warp struct of a force's arrays: w, w_dot, and the rows of w's adjoint, (numbers, members x rows)."""
+    """Return the Warp struct of a force's arrays: values, tangents and rows of the adjoint."""
     return struct_of("Table", precision, **dict.fromkeys(("values", "dots", "rows"), wp.array2d(dtype=precision.real)))
 
 
@@ -63,7 +61,7 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def place(k: real, size: real) -> real:
-        """Return an index into an axis of a size. A negative index counts from the end; one out of range gives NaN."""
+        """Return a valid index. A negative index counts from the end, and an index out of range gives NaN."""
         found = k
         if k < none:
             found = k + size
@@ -92,8 +90,8 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the kernels that write a parameter's values in a step into a table, and add a table's adjoint to that of the
-    parameter. Values are (members, steps x size), or the same in all steps (members, size)."""
+    """Make the kernels that copy a parameter's values in a step to a table, and that add the adjoint of the table to
+    the adjoint of the parameter."""
     typed = TypesByName(wp.array2d(dtype=precision.real), {wp.int32: "step"})
 
     @wp.kernel(module=arrays_module(precision, True, taped))
@@ -114,7 +112,7 @@ def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 
 class Numbers:
-    """The numbers of some parameters, one parameter after the other in a table (members, numbers)."""
+    """The numbers of several parameters, stored in one table (members, numbers)."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._kernels = packing_kernels(layout.precision, taped) if parameters else None
@@ -138,8 +136,7 @@ class Numbers:
 
 
 class OwnParameters:
-    """A user's function's parameters by names of kernel arguments, with tangent and adjoint: times, numbers and
-    vectors as one vector theta, and all arrays as one table, for each scene."""
+    """The parameters of a user-defined function, with tangent and adjoint, by names of kernel arguments."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._layout, own = layout, [one for one in parameters if one.axis is not Axis.ARRAY]
@@ -150,7 +147,7 @@ class OwnParameters:
         options: dict[str, Any] = {"dtype": dtype, "device": layout.device}
         self._theta, self._theta_dot = wp.zeros(members, **options, requires_grad=taped), wp.zeros(members, **options)
         self._theta_bar = wp.zeros(layout.all_particles, **options)
-        """(n,) each particle's term of the adjoint of theta in a step."""
+        """Terms of particles in the adjoint of the parameter vector (n,)."""
         self._sum_theta = layout.sum_of(dtype) if own else None
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (members * max(self._size, 1))), 1)
@@ -158,7 +155,7 @@ class OwnParameters:
 
     @property
     def threads(self) -> int | None:
-        """Return the number of threads of the adjoint; None for one per particle."""
+        """Return the number of threads of the adjoint; None for one thread per particle."""
         return self._layout.members * self.rows if self._size else None
 
     def now(self, step: StepContext) -> dict[str, Any]:
@@ -173,7 +170,7 @@ class OwnParameters:
         return {**self._told(step, "_back"), "theta_bar": self._theta_bar, "rows": self.rows}
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
-        """Add the adjoints of theta and of the table to those of the parameters."""
+        """Add the terms of particles to the adjoints of the parameters."""
         if self._sum_theta is not None:
             self._numbers.add(step, self._flat(self._sum_theta(self._theta_bar)), bar.parameters)
         if self._size:
@@ -239,24 +236,24 @@ INPUTS = {
 
 @dataclass(frozen=True)
 class Formula:
-    """A user's function in the form that kernels call. Formulas with the same texts and outside numbers are equal."""
+    """A user-defined function for kernels. Formulas are equal if they compute the same."""
 
     name: str
     text: str
-    """Source text of the function, with the precision's types and outside numbers written out."""
+    """Source code of the function for Warp."""
     inputs: tuple[str, ...]
-    """Names of the first arguments: two vectors or numbers, and optionally time."""
+    """Names of the first arguments: two vectors or numbers, and optionally the time."""
     fields: tuple[str, ...]
     kind: str
     parameters: tuple[str, ...]
     arrays: tuple[str, ...]
     outside: str
-    """A text of all values and Warp functions that `text` refers to."""
+    """Text with all outside values and Warp functions that the function uses."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     phases: int = 0
 
     def of_phases(self, what: str, phases: int) -> "Formula":
-        """Return the formula for a number of phases; raise `InputError` if it takes mass fractions of others."""
+        """Return the formula for this number of phases. Raise `InputError` if the function needs a different number."""
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
@@ -296,8 +293,8 @@ class Formula:
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
-    """Read a user's function, called ``kind`` in messages. Return it with the values of its parameters, given or
-    default. Raise `InputError` if the function is invalid."""
+    """Read a user-defined function, and return it with the values of its parameters. ``kind`` is its name in messages.
+    Raise `InputError` if the function is invalid."""
     what = f"{kind} function {function.__name__}"
     taken, values = _arguments(what, function, parameters, INPUTS[kind])
     inputs = tuple(name for name in taken if name not in INPUTS[kind].fields)
@@ -337,8 +334,6 @@ def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs
 def _arguments(
     what: str, function: FunctionType, given: Mapping[str, Any], first: Inputs
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return names of the inputs and fields, and the parameters' values in the order of the arguments. The first two
-    inputs may have any names. A third input must have a name of time, because it may be a parameter without value."""
     signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
@@ -369,7 +364,7 @@ def _arguments(
 
 
 def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> None:
-    """Compile a module with a user's function; raise `InputError` with the first message of Warp's compiler."""
+    """Compile a module with a user-defined function. Raise `InputError` with the first message of Warp's compiler."""
     with TemporaryFile() as said:
         try:
             with c_stderr_to(said.fileno()):
@@ -390,8 +385,11 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
-    """Make the Warp function that calls a user's function, with two vectors or numbers, theta, and the arguments of
-    `Formula.takes` and `Formula.reads`. In 2-D z of the result is 0."""
+    """Make the Warp function that calls a user-defined function.
+
+    Its arguments are two vectors or numbers, the parameter vector, and the arguments of `Formula.takes` and
+    `Formula.reads`. In 2-D the z component of the result is 0.
+    """
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
     terms, first = [], 0

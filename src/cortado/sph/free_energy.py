@@ -1,4 +1,5 @@
-"""Helmholtz free energies F(c) = alpha f(c) of a mixture, and mobilities of its phases (Yang et al. 2015).
+"""Helmholtz free energies F(c) = alpha f(c) of a mixture with mass fractions c, and mobilities of its phases (Yang et
+al. 2015).
 
     double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015)
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
@@ -6,7 +7,7 @@
     constant     m = 1
     degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
 
-delta keeps the mobility positive and smooth if a fraction strays out of [0, 1].
+The constant delta keeps the mobility positive and smooth if a fraction leaves the range from 0 to 1.
 
 The phases diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
 
@@ -14,12 +15,13 @@ The phases diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
     c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
     B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x^T G / (|x|^2 + 0.01 h^2)
 
-chi is the chemical potential. The terms of B are antisymmetric in i and j, so that each phase keeps its mass, sum_i m_i
-c_k,i, to round-off. P keeps sum_k c_k constant. The discrete free energy
+chi is the chemical potential. The terms of B are antisymmetric in i and j, so that the mass sum_i m_i c_k,i of each
+phase is constant to round-off. P keeps sum_k c_k constant. The discrete free energy
 
     E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
 
-decreases on particles at rest (F <= 0). Clipping fractions would break conservation and decrease.
+decreases on particles at rest, because F is not positive. Fractions are not clipped, because that would break
+conservation and the decrease of energy.
 """
 
 from collections.abc import Callable
@@ -50,17 +52,18 @@ FLOOR = 1e-3
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """A free energy f(c) of mass fractions c (phases,), for kernels and for NumPy. Users may define energies."""
+    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define free
+    energies."""
 
     name: str
     value: Callable[[np.ndarray], np.ndarray]
-    """Function f of fractions (n, phases) -> (n,)."""
+    """Function from mass fractions (n, phases) to free energies (n,)."""
     curvature: float
-    """The greatest eigenvalue, for fractions in [0, 1], of the Hessian of f without its part along (1, ..., 1); the
-    eigenvalue bounds the time step."""
+    """Greatest eigenvalue of the Hessian of the free energy, for mass fractions from 0 to 1 with a constant sum. It
+    bounds the time step."""
     functions: Callable[[Precision, int], Any]
-    """Returns, for a precision and a number of phases, an object with the Warp functions ``gradient`` (grad f) and
-    ``hessian_product`` (H u)."""
+    """Function from a precision and a number of phases to an object with two Warp functions. ``gradient`` is the
+    gradient of the free energy, and ``hessian_product`` the product of its Hessian and a vector."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -71,7 +74,7 @@ class FreeEnergy:
             raise InputError(f"FreeEnergy {self.name}'s curvature is {self.curvature}, but must be at least 0.")
 
     def check(self, precision: Precision, phases: int, device: Any) -> None:
-        """Raise `InputError` if ``functions`` fails, or does not return functions of that many fractions."""
+        """Raise `InputError` if ``functions`` fails, or if the Warp functions do not take ``phases`` mass fractions."""
         what = f"FreeEnergy {self.name}'s functions"
         try:
             found = self.functions(precision, phases)
@@ -98,7 +101,8 @@ class Mobility:
     name: str
     greatest: Callable[[int], float]
     functions: Callable[[Precision, int], Any]
-    """Warp functions ``value`` and ``gradient`` (grad m) of fractions."""
+    """Function from a precision and a number of phases to an object with the Warp functions ``value`` and ``gradient``
+    of the mobility."""
 
 
 @cache
@@ -228,8 +232,6 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
     @fluid_sum(discretisation)
     @typed
     def spread_adjoint(x_ij, n_i, n_j, w_i, w_j, u_ij, y_i, y_ij, s) -> tuple[vector, real, real, fractions, real]:
-        """Return, for adjoints y of the sums, a pair's terms in the adjoints of x_i, n_i, w_i and u_i, and in the
-        product of y_i with the sum of i."""
         f = factor(x_ij, s)
         weight = w_i / n_j + w_j / n_i
         work = wp.dot(u_ij, y_ij)
@@ -241,20 +243,20 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
 
 SAFETY = 0.5
-"""Ratio of a substep of diffusion to its stability limit on the lattice."""
+"""Safety factor of a diffusion substep."""
 MOST_SUBSTEPS = 10_000
 
 
 def stable_substeps(
     scene: Scene, energy: FreeEnergy, time_step: float, mobility: float, width: float, densities: np.ndarray
 ) -> int:
-    """Return the number of stable substeps of diffusion in a time step [s], given a mobility [m2/s], an interface width
-    [m] and rest densities (phases,) [kg/m3]. The length of a substep is at most
+    """Return the number of stable diffusion substeps in a time step [s]. ``mobility`` is in m2/s, ``interface_width``
+    in m, and ``rest_density`` (phases,) in kg/m3. The length of a substep is at most
 
         dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 
     with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is ``ratio``
-    times as heavy, a light one diffuses up to (1 + ratio) / 2 times as fast. Raise `OutOfRangeError` for more than
+    times as heavy, a light particle diffuses up to (1 + ratio) / 2 times as fast. Raise `OutOfRangeError` for more than
     `MOST_SUBSTEPS`.
     """
     mixture, cut = scene.mixture, scene.discretisation
@@ -282,7 +284,7 @@ class Diffusion:
 
 @cache
 def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
-    """Make the kernels ``potential`` and ``flux`` of a substep of diffusion; the adjoint of ``flux`` is two kernels."""
+    """Make the kernels ``potential`` and ``flux`` of a diffusion substep, with derivatives."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     fractions = precision.fractions(phases)

@@ -1,13 +1,14 @@
 """Free bodies without slip in the implicit viscous solve, with derivatives; see `cortado.sph.friction_kernels`.
 
-The velocities of bodies are further unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). With the momenta M
-of a body, the force F(u, U) on the body, and its velocities U at the start of the step with gravity and contact,
+The velocities of bodies are additional unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). M is the mass
+matrix of a body, F(u, U) the force on the body, and U its velocities at the start of the step with gravity and contact.
+Then
 
     U' = U + M^-1 J,   J = dt F(u', U'),
 
-are further rows of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted with the
-masses of particles and M. J is added to the momenta by contact before pressures act, so that light bodies neither
-oscillate nor need smaller steps.
+are additional equations of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted
+with the masses of particles and M. J is added to the momenta by contact before pressures act, so that light bodies
+neither oscillate nor need smaller steps.
 
 Friction resists velocities before pressures act, but pressures hold fluid and bodies against gravity. Therefore u
 excludes gravity, and U includes the change by the pressures of the previous step.
@@ -38,7 +39,7 @@ def begun(body: FreeBody | Changes) -> Arrays:
 
 
 class BodyFriction:
-    """Arrays of the friction with one body; with a ``suffix`` of names, their tangents or adjoints."""
+    """Arrays of the friction with one rigid body. ``suffix`` selects tangents or adjoints."""
 
     def __init__(self, layout: Layout, suffix: str = ""):
         precision, members = layout.precision, layout.members
@@ -49,15 +50,13 @@ class BodyFriction:
         motion = [f"{name}{suffix}" for name in VELOCITIES] + self._momenta
         self.arrays = layout.arrays(suffix, **kinds, **dict.fromkeys(("arm", "rub", "couple"), vector))
         self.arrays |= zeros(dict.fromkeys(motion, (members, vector)), layout.device)
-        """By argument names; V and W are those at the start of the step with gravity and contact, and after the solve
-        at its end, and the last two the momenta of the body from contact, friction and previous pressures."""
+        """Arrays by names of kernel arguments: velocities before and after the solve, and momenta of the body."""
         self.turned = wp.zeros(members, dtype=vector, device=layout.device)
         self.none_total = wp.zeros(members, dtype=real, device=layout.device)
         self.impulse = {"impulse": wp.zeros(members, dtype=six, device=layout.device)}
-        """J."""
 
     def momenta(self, body: FreeBody | Changes) -> Iterator[tuple[wp.array, wp.array, wp.array]]:
-        """Yield the body's momenta, each with those from contact and from previous pressures."""
+        """Yield the momenta of the body, with the momenta by contacts and by the pressures of the previous step."""
         return zip((self.arrays[one] for one in self._momenta), body.given.values(), body.pressed.values(), strict=True)
 
     def add_up(self, body: FreeBody | Changes) -> None:
@@ -70,7 +69,7 @@ class BodyFriction:
 
 
 class BodyRows:
-    """Further unknowns of a solve, the momenta of a body in each scene (`cortado.sph.friction_kernels`)."""
+    """The additional unknowns of a solve for one rigid body."""
 
     def __init__(self, layout: Layout):
         six, vector = layout.precision.six, layout.precision.vector
@@ -86,7 +85,7 @@ class BodyRows:
 
 
 class FreeFriction:
-    """The friction between the fluid and all free bodies without slip; without them it does nothing."""
+    """The friction between the fluid and all no-slip free bodies. Without no-slip bodies the methods do nothing."""
 
     def __init__(self, setting: Setting, constants: Named):
         layout, scene = setting.layout, setting.scene
@@ -101,7 +100,7 @@ class FreeFriction:
             self.move, self.lifts = move_kernels(layout.precision), lift_kernels(layout.precision)
         vector = layout.precision.vector
         self.lift = {"lift": wp.zeros(layout.members, dtype=vector, device=layout.device)}
-        """-dt g."""
+        """Negative velocity change by gravity in a step."""
 
         self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
 
@@ -123,7 +122,7 @@ class FreeFriction:
             step.launch(self.kernels.lean.forward, body.before, own.arrays, sums)
 
     def hang(self, step: StepContext, u: wp.array) -> None:
-        """Subtract the velocity change by gravity from the particles' velocities u: pressures balance gravity."""
+        """Subtract the velocity change by gravity from the velocities ``u`` of particles."""
         if self.rows:
             step.launch(self.kernels.hang.forward, self.lift, u=u)
 
@@ -136,12 +135,12 @@ class FreeFriction:
         step.launch(kernel, *groups, begun(body), *body.known(step), threads=self.layout.members)
 
     def pull(self, step: StepContext, *known: Named, v: wp.array) -> None:
-        """Add the terms of bodies, at their present velocities, to A and T of velocities v."""
+        """Add the terms of rigid bodies to the velocity sums and stresses of particles with velocities ``v``."""
         for _, own, _ in self.each(step):
             step.launch(self.kernels.pull, own.arrays, self.constants, *known, v=v)
 
     def push(self, step: StepContext, *known: Named, v: wp.array, acceleration: wp.array) -> None:
-        """Add to the accelerations by the stress of velocities v, and write the residual of the bodies' rows."""
+        """Add the friction of rigid bodies to the accelerations of particles with velocities ``v``."""
         for _, own, rows in self.each(step):
             self.rub(step, own, *known, v=v)
             add(own.arrays["rub"], acceleration)
@@ -149,29 +148,30 @@ class FreeFriction:
             wp.copy(rows.arrays["r"], own.whole())
 
     def rub(self, step: StepContext, own: BodyFriction, *known: Named, v: wp.array) -> None:
-        """Write the accelerations and couples of particles by a body at its present velocities."""
+        """Write the accelerations and couples of particles by the friction of one rigid body."""
         step.launch(self.kernels.rub.forward, own.arrays, self.constants, *known, v=v)
 
     def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
-        """Add to B p and to the particles' terms of p^T B p, and write the loads of the bodies' rows."""
+        """Add the terms of rigid bodies to the product of the solve's matrix and the vector ``p``."""
         for _, own, rows in self.each(step):
             step.launch(self.kernels.push, rows.velocities, own.arrays, self.constants, found, *known, v=p)
             rows.load = own.whole()
 
     def lean(self, step: StepContext, known: tuple[Named, ...], p: wp.array) -> None:
-        """Add to A and T of p the terms of bodies that move with the velocities V and W of their rows."""
+        """Add the terms of rigid bodies to the velocity sums and stresses of the vector ``p``."""
         for _, own, rows in self.each(step):
             step.launch(self.kernels.pull, rows.velocities, own.arrays, self.constants, *known, v=p)
 
     def finish(self, step: StepContext) -> None:
-        """Add the impulses of the solve to the bodies' momenta, and write the velocities at the end of the step."""
+        """Add the impulses of the solve to the momenta of rigid bodies, and write the velocities at the end of the
+        step."""
         for body, own, rows in self.each(step):
             rows.launch(step, rows.kernels.give, body.given, own.impulse)
         self.start(step)
 
     def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
-        """Add the action of bodies on particles after the step, ``rub`` or ``couple``, to the sum over the walls of a
-        solid or of all solids. ``now`` contains the arrays of the resisted velocities."""
+        """Add the action of rigid bodies on particles to ``total``, the action of a solid or of all solids. ``name`` is
+        "rub" or "couple"."""
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
                 self.rub(step, own, now, v=now["v"])
@@ -191,7 +191,6 @@ class FrictionChanges:
     def _each(
         self, step: StepContext, of: Tangents | Adjoints
     ) -> Iterator[tuple[Changes, BodyFriction, BodyFriction, BodyRows]]:
-        """Yield for each body without slip: its changes, those of its arrays, its arrays, and its rows."""
         changes = (one for one in of.bodies if one.body.table.sticks)
         for (body, own, rows), change in zip(self._friction.each(step), changes, strict=True):
             yield change, self._own[body.table.name], own, rows
@@ -281,12 +280,12 @@ class FrictionAdjoint(FrictionChanges):
                 array.zero_()
 
     def take(self, step: StepContext, bar: Adjoints) -> None:
-        """Start the solve from the adjoints of the impulses on bodies, which are velocities."""
+        """Start the adjoint solve from the adjoints of the impulses on rigid bodies."""
         for change, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.take, change.given)
 
     def heed(self, step: StepContext, bar: Adjoints) -> None:
-        """Write the residual of these velocities in the bodies' rows, given the loads by the velocities."""
+        """Write the residuals of rigid bodies in the adjoint solve."""
         for _, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.heed, load=rows.load)
 
@@ -332,8 +331,8 @@ class FrictionAdjoint(FrictionChanges):
             self._shared(step, kernels.lean.adjoint, change.before, change.body.before, *groups)
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
-        """Apply the adjoints of the bodies' velocities at the end and of H, Y, N and r. Add to the adjoint of gravity
-        from ``u_bar``, the adjoint of the particles' velocities at the end."""
+        """Apply the adjoints of the bodies' final velocities. ``u_bar`` is the adjoint of the particles' final
+        velocities."""
         of = self._friction
         if of.rows:
             share, sizes = self._shares["V_bar"], {"time_step_bar": bar.parameters["time_step"]}

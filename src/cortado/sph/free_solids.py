@@ -1,16 +1,12 @@
 """Rigid bodies that fluid and gravity move, as a part of a step.
 
-The part puts walls at the poses that bodies would reach with their present velocities, and writes the poses at the end
-of the step. In between the solver accelerates the bodies and stores V, W and L of the end in `FreeBody.moved`.
+At the start of a step, the walls of a body are put at the predicted pose: the pose that the body would reach with its
+current velocities. The solver then changes the velocity and the angular momentum of the body. At the end of the step,
+the body moves with its new velocity and angular velocity. Momentum and angular momentum are conserved.
 
-A body's rotation is R = Q R(w_0), with the initial rotation w_0. A state stores the columns of Q - I.
-
-Kernels of a step have a thread for each scene. At the start of the step a body with density rho has its centre of mass
-at c, the rotation R, the velocities V and W, and the angular momentum L = rho R I R^T W, where I is its inertia at a
-density of 1. Volumes are in units of a particle's volume. If the scene gives a mass, rho is the mass and I the inertia
-of a mass of 1. The step first puts the walls at the predicted pose, c' = c + dt V and R' = R(dt W) R. Fluid, gravity
-and contact change V and L to V_1 and L_1. The body ends at c + dt V_1 with the rotation R(dt W_1) R. The choice W_1 =
-R' I^-1 R'^T L_1 / rho, which belongs to L_1 at the predicted pose, conserves momentum and angular momentum.
+A state stores the rotation of a body as the columns of a matrix: the rotation since the start minus the unit matrix. If
+the scene gives a mass instead of a density, the mass takes the place of the density in kernels. Volumes are in units of
+a particle's volume.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,9 +39,7 @@ GIVEN = ("pushed", "twisted")
 
 @cache
 def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a free body in 2 or 3 dimensions: of the pose of its walls with V, W and L, and of the state
-    after the step from V_1, W_1 and L_1. The adjoint of the state before the step overwrites that of the state after
-    it."""
+    """Make the kernels of a free body in 2 or 3 dimensions, for the predicted pose and for the state after the step."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
@@ -77,7 +71,7 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
     @wp.func
     def evened(Q: matrix) -> matrix:
-        """Return Q - I after correcting round-off of Q, by which its axes would change their lengths or angles."""
+        """Return the rotation matrix ``Q`` minus the unit matrix, after a correction of round-off."""
         return real(0.5) * Q * (real(3.0) * wp.identity(n=3, dtype=real) - wp.transpose(Q) * Q) - wp.identity(
             n=3, dtype=real
         )
@@ -157,21 +151,21 @@ class FreeTable:
     name: str
     number: int
     weight: str
-    """Name of the parameter for the body's density or mass."""
+    """Name of the parameter for the density or the mass of the body."""
     mass: Mass
-    """Mass and inertia for a value 1 of this parameter, in units of a particle's volume."""
+    """Mass and inertia of the body for a density or mass of 1."""
     hold: Hold
     sticks: bool = False
 
     @property
     def inertia(self) -> np.ndarray:
-        """Return the inertia (3, 3) about the body's hinge, or without a hinge about its centre of mass."""
+        """Return the inertia (3, 3) about the body's hinge. Without a hinge, return the inertia about the centre of
+        mass."""
         return inertia_about(self.hold, self.mass)
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Return bounds of a held body by kernel argument names: the volume by which pressures push the body, infinite
-        if its middle is held, and the greatest inverse of its inertia, 0 if it does not turn."""
+        """Return the effective volume of the body and its greatest inverse inertia, by names of kernel arguments."""
         goes, turns = any((*self.hold.moving, *self.hold.arm)), self.hold.turning > 0
         greatest = np.linalg.eigvalsh(np.linalg.pinv(self.mass.inertia)).max()
         return {"pushed_volume": self.mass.volume if goes else np.inf, "greatest": float(greatest) if turns else 0.0}
@@ -197,21 +191,21 @@ class FreeSolids:
 
 
 class Push(Protocol):
-    """An object that pushes free bodies besides fluid and gravity: it adds to `FreeBody.given`."""
+    """Protocol of forces on free bodies in addition to fluid and gravity, such as contacts and springs."""
 
     def look(self, step: StepContext) -> None:
-        """Add the momenta that bodies get."""
+        """Add to the momenta of rigid bodies, `FreeBody.given`."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Return the tangent, whose method ``look(step, dot)`` adds to `Changes.given`."""
+        """Return the tangent. Its method ``look(step, dot)`` adds to `Changes.given`."""
 
     def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Return the adjoint, whose method ``look(step, bar)`` reads the adjoints in `Changes.given`."""
+        """Return the adjoint. Its method ``look(step, bar)`` reads the adjoints in `Changes.given`."""
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
-    """Return the momenta that two bodies get, or their tangents or adjoints, the second's as in ``pushed_other``. If
-    ``other`` is -1, the first body's arrays take the second's place, and kernels add 0 there."""
+    """Return the momenta of two rigid bodies, or the tangents or adjoints of the momenta. If ``other`` is -1, return
+    the arrays of the first body twice."""
     others = each[body if other < 0 else other].given
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
@@ -224,14 +218,13 @@ class FreeBody:
         units = {"position": "m", "rotation": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
         self.names = {label: name(table.name) for label, name in NAMES.items()}
         self.names |= {label: f"{table.name}.{label}" for label in AXES}
-        """Names of the body's state fields by kernel argument names."""
+        """Names of the body's state fields, by names of kernel arguments."""
         begun = (
             StateField(self.names[label], unit, angles.get(label, Entry.VECTOR), Axis.SCALAR, self.names[label])
             for label, unit in units.items()
         )
         self.fields = (*begun, *(StateField(self.names[label], "", Entry.VECTOR, Axis.SCALAR) for label in AXES))
         self.begun = layout.state(self.fields)
-        """Values at the start of the step."""
         matrix = layout.precision.matrix
         inertia, inverse = table.inertia, np.linalg.pinv(table.inertia)
         self.constants: dict[str, Any] = {**poses, "inertia": matrix(*inertia.ravel())}
@@ -239,9 +232,9 @@ class FreeBody:
         self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
         self.constants |= table.bounds
         self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
-        """Momentum, and its moment, from contacts, springs and friction with fluid."""
+        """Momentum and angular momentum by contacts, springs and friction."""
         self.pressed = {name: wp.zeros_like(array) for name, array in self.given.items()}
-        """Momentum and moment by the pressures of the previous step, only for bodies without slip."""
+        """Momentum and angular momentum by the pressures of the previous step, for no-slip bodies."""
         self.before, self.moved = (
             {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
         )
@@ -261,7 +254,7 @@ class Changes:
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
         self.turned_end = wp.zeros(**vectors)
-        """The term, from the end of the step, of the adjoint of a further turn of R."""
+        """Adjoint of a small rotation of the body, from the end of the step."""
 
     def clear(self) -> None:
         groups = self.before, self.moved, self.given, self.pressed

@@ -1,14 +1,14 @@
-"""Viscous friction between fluid and a free body without slip, by each particle's sums over the body's walls.
+"""Viscous friction between fluid and a free body without slip, from each particle's sums over the walls of the body.
 
-As with other walls without slip (`cortado.sph.stress_forces`), the body acts like a neighbour at the point of its
-surface below particle i, with the velocity of the body. Let y_b be the vector from the surface at wall particle b, with
-weight s_b, to particle i, and r the vector from the body's middle c' to particle i. The surface point is at c' + r -
-y_b and has the velocity V + W x (r - y_b). The body's effect on the particle follows from three sums,
+As with other walls without slip (`cortado.sph.stress_forces`), the body acts like a neighbour at the surface point
+below particle i, which moves with the body. y_b is the vector from the surface at wall particle b, with weight s_b, to
+particle i, and r the vector from the body's middle c' to particle i. The surface point is at c' + r - y_b and has the
+velocity V + W x (r - y_b). The effect of the body on the particle follows from three sums,
 
     H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
 
-and from z = v_i - V - W x r. With the matrix [W] of the cross product, M_i gets N, R_i gets tr N / mu_i, A_i gets z Y^T
-+ [W] N, and the acceleration and its couple about the particle are
+and from z = v_i - V - W x r. [W] is the matrix of the cross product. M_i gets the term N, R_i gets tr N / mu_i, and A_i
+gets z Y^T + [W] N. The acceleration and its couple about the particle are
 
     m_i a_i = -(T_i Y + C mu_i (H z + W x Y)),
     m_i c_i = -(ax(T_i N) + C mu_i (Y x z + (tr N - N) W)),   ax(B) = (B_zy - B_yz, B_xz - B_zx, B_yx - B_xy).
@@ -38,8 +38,8 @@ from cortado.sph.stress_kernels import fluidity_function, traction_function
 
 @cache
 def friction_functions(precision: Precision) -> SimpleNamespace:
-    """Make functions ``lean`` of a body's term in A, ``rub`` of a particle's acceleration and couple, and ``bear`` of
-    force and torque on the body, six numbers."""
+    """Make three Warp functions of the friction: ``lean`` for the velocity sums of a particle, ``rub`` for its
+    acceleration and couple, and ``bear`` for force and torque on the body."""
     real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
 
@@ -65,9 +65,11 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of friction with a body in 2 or 3 dimensions. ``hold`` computes H, Y, N and r; ``hang`` adds a
-    ``lift`` to u; ``thicken`` adds to M and R; ``lean``, ``rub`` and ``bear`` are `friction_functions`. ``pull`` adds
-    to A and T. ``push`` adds to B v and to its product with v in a solve, and writes the load of the body."""
+    """Make the kernels of friction with a rigid body in 2 or 3 dimensions.
+
+    ``hold`` computes sums over the body's wall particles. ``hang`` subtracts the velocity change by gravity.
+    ``thicken``, ``pull`` and ``push`` add the terms of the body to the sums, stresses and accelerations of particles.
+    """
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, six, known = precision.matrix, precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
@@ -177,7 +179,7 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
 @cache
 def lift_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of -dt g, minus the velocity change by gravity in a step."""
+    """Make the kernels of the negative velocity change by gravity in a step."""
     real, vector = precision.real, precision.vector
 
     def lift(time_step_i: real, gravity_i: vector) -> vector:
@@ -188,14 +190,11 @@ def lift_kernels(precision: Precision) -> Kernels:
 
 @cache
 def row_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of a body's rows in a solve, with a thread for each scene; a row is a momentum of six numbers.
-    ``rise`` are the velocities that the momenta r give the body, which may be held (`cortado.sph.moving_solids`); V and
-    W are the velocities by p.
+    """Make the kernels of a body's unknowns in the viscous solve, with a thread for each scene. The unknowns of a body
+    are six numbers: momentum and angular momentum.
 
     `cortado.sph.viscous_solve` calls ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give`` adds the
-    impulse of the solution to the body's momenta; ``lengthen`` adds the time step's tangent to that of a load.
-    ``take`` starts the adjoint solve from velocities, the adjoint of the impulse, and ``heed`` writes their residual r.
-    ``answer`` adds the velocities of the solution, and adds to the adjoint of the time step.
+    impulse of the solution to the body's momenta. ``take``, ``heed`` and ``answer`` are for the adjoint solve.
     """
     real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     module, hold = free_module(precision, "rows"), hold_functions(precision)

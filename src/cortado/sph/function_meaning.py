@@ -1,7 +1,7 @@
-"""Rewrites a user's function so that Warp computes the same as Python, in the precision of the run.
+"""Rewrites a user-defined function so that Warp computes the same as Python.
 
-Operators with another meaning in Warp are replaced by Warp functions with Python's meaning; code that cannot be
-replaced is refused.
+Operators with a different meaning in Warp are replaced by Warp functions with Python's meaning. Code that cannot be
+replaced raises an error.
 """
 
 import ast
@@ -21,12 +21,13 @@ from cortado.errors import InputError
 from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, check_returns, counts_of
 
 REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "cortado_nearest", "cortado_whole"
-"""Names, in compiled texts, of the functions for a % b, a // b, round(a) and int(a)."""
+"""Names of the Warp functions for a % b, a // b, round(a) and int(a)."""
 
 
 @cache
 def meanings(precision: Precision) -> dict[str, Any]:
-    """Make Warp functions of Python's operators, by name. a % b, with the sign of b, and a // b have CPython's bits."""
+    """Make Warp functions of Python's operators, by name. Results of a % b and a // b are equal to CPython's bit for
+    bit."""
     real, module = precision.real, kernel_module(f"python_{precision.name}")
     none, one, half = (wp.constant(real(value)) for value in (0.0, 1.0, 0.5))
 
@@ -58,7 +59,7 @@ def meanings(precision: Precision) -> dict[str, Any]:
 
 REAL, VECTOR = "cortado_real", "cortado_vector"
 PLACE, READ, READ_OF = "cortado_place", "cortado_read", ("cortado_e", "cortado_w", "cortado_member", "cortado_row")
-"""Names, in compiled texts, of the functions that read arrays, and of their arguments before an index."""
+"""Names of the Warp functions that read arrays, and of their first arguments."""
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 _OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
 _CALLS = {"round": NEAREST, "int": WHOLE}
@@ -67,13 +68,13 @@ Lines = ast.AST | list[ast.stmt]
 
 
 class InPrecision(ast.NodeTransformer):
-    """A rewriting of a function's text for a precision: outside values are written out, loops are unrolled."""
+    """Rewrites the source code of a function for a precision: outside values become numbers, and loops are unrolled."""
 
     def __init__(self, what: str, scope: Mapping[str, Any], local: set[str], shapes: Mapping[str, tuple[int, ...]]):
         self._what, self._scope, self._local = what, scope, local
         sizes = [prod(shape) for shape in shapes.values()]
         self._arrays = {name: (sum(sizes[:k]), shape) for k, (name, shape) in enumerate(shapes.items())}
-        """Arrays, each with the index of its first number in the table of all arrays, and its shape."""
+        """Start index and shape of each array in the table of all arrays, by name."""
         self._counts: dict[str, int] = {}
         self._given = set[str]()
 
@@ -111,7 +112,6 @@ class InPrecision(ast.NodeTransformer):
         return node
 
     def _read(self, node: ast.Subscript, first: int, shape: tuple[int, ...]) -> ast.AST:
-        """Return the call that reads a number of an array; indices unknown here are checked during the run."""
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if len(parts) != len(shape) or any(isinstance(part, (ast.Slice, ast.Starred)) for part in parts):
             found = f"{self._what} has {ast.unparse(node)}"
@@ -179,7 +179,6 @@ class InPrecision(ast.NodeTransformer):
         return ast.Call(self.visit(node.func), given, keywords)
 
     def _index(self, node: ast.expr) -> int:
-        """Return the whole number of an index as Python computes it; raise `InputError` if it is not a whole number."""
         number = self._whole(node)
         if number is None:
             found = f"{self._what} has the index {ast.unparse(node)}"
@@ -234,9 +233,11 @@ MOST_TURNS = 256
 def text_for_warp(
     what: str, function: ast.FunctionDef, frozen: Frozen, shapes: Mapping[str, tuple[int, ...]], kind: str
 ) -> str:
-    """Return the text of a user's function for Warp, in the precision of the run. Raise `InputError` for code that Warp
-    lacks, cannot differentiate or understands differently from Python, and if the function may not return a ``kind``.
-    ``shapes`` are those of arrays."""
+    """Return the source code of a user-defined function for Warp. ``shapes`` are the shapes of arrays by name.
+
+    Raise `InputError` for code that Warp lacks, cannot differentiate or understands differently from Python. Also raise
+    `InputError` if the function may not return a ``kind``.
+    """
     for helper in frozen.helpers:
         tree = helper.adj.tree
         DerivativeCheck(what).visit(tree)
@@ -260,7 +261,7 @@ MATH = (
 
 
 def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for calls of anything but Warp's functions and types, and those in `BUILTINS` and `MATH`."""
+    """Raise `InputError` for calls of functions that Warp does not have, except names in `BUILTINS` and `MATH`."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Call):
             continue
@@ -279,7 +280,7 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
 
 
 def check_truths(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for ``and`` and ``or`` used as numbers: Python returns an operand, Warp a truth value."""
+    """Raise `InputError` for ``and`` and ``or`` used as numbers. Python and Warp return different values."""
     tests: set[ast.AST] = set()
     for node in ast.walk(function):
         if isinstance(node, (ast.If, ast.IfExp, ast.While, ast.Assert)):
@@ -296,7 +297,7 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for code in a function under ``@wp.func`` that has another meaning in Python."""
+    """Raise `InputError` for code in a ``@wp.func`` function that means something different in Python."""
     check_truths(what, function)
     wholes = set(counts_of(function))
     for node in ast.walk(function):

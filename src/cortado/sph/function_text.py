@@ -1,8 +1,7 @@
-"""A user's function as two texts: the source, which Warp compiles, and the meaning, which differs if the function
-computes something else. The meaning consists of the code and of the numbers, functions and objects that the code reads.
+"""The source code of a user-defined function, and a text that changes whenever the function changes.
 
-The source is checked against the function, with the values of outside names when the force is made. Code that Warp
-cannot differentiate is refused.
+The text consists of the source code and of all numbers, functions and objects that the function reads. Code that Warp
+cannot differentiate raises an error.
 """
 
 import ast
@@ -32,7 +31,8 @@ _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
 
 
 def plain_function(kind: str, function: Any) -> FunctionType:
-    """Return the Python function that a user gives, unwrapped from Warp; raise `InputError` for anything else."""
+    """Return the plain Python function of a user's function, which may be a Warp function. Raise `InputError` for any
+    other object."""
     plain = function.func if isinstance(function, wp.Function) else function
     if not isinstance(plain, FunctionType):
         raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
@@ -49,7 +49,7 @@ def check_bare(what: str, function: Any) -> None:
 
 
 def source_of(what: str, function: FunctionType) -> str:
-    """Return the source text of a function; raise `InputError` if it cannot be found."""
+    """Return the source code of a function. Raise `InputError` if it cannot be found."""
     if function in _SENT:
         return _SENT[function]
     try:
@@ -64,8 +64,8 @@ def keep_source(function: FunctionType, source: str) -> None:
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
-    """Parse the text of a function, without annotations, defaults and decorators. Raise `InputError` if the text
-    defines another function, for example because its file has changed since the import."""
+    """Parse the source code of a function, without annotations, defaults and decorators. Raise `InputError` if the
+    source code does not match the function, for example because its file has changed since the import."""
     try:
         found: ast.AST = ast.parse(source).body[0]
     except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
@@ -88,7 +88,6 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
 
 
 def _compiled(found: ast.FunctionDef, of: CodeType) -> CodeType | None:
-    """Compile a definition inside a function that defines the names of the enclosing scope; None without such code."""
     doc = found.body[0]
     if isinstance(doc, ast.Expr) and isinstance(doc.value, ast.Constant) and isinstance(doc.value.value, str):
         doc.value.value = of.co_consts[0] if of.co_consts else None  # its indentation is no matter
@@ -123,8 +122,10 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 
 
 class Frozen:
-    """The frozen scope of a function and of all functions that it calls: copies of numbers, vectors, attributes of
-    modules and objects, and functions under ``@wp.func`` with their frozen scopes."""
+    """Copies of all outside values that a function and the functions it calls read.
+
+    They are numbers, vectors, attributes of modules and objects, and ``@wp.func`` functions.
+    """
 
     def __init__(self, what: str, function: FunctionType):
         self._what, self._made = what, dict[Any, Any]()
@@ -182,7 +183,7 @@ class Frozen:
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """A check that refuses code with silently wrong derivatives: loops that are not unrolled, changes of single
+    """Raises an error for code with wrong derivatives in Warp: loops that are not unrolled, and changes of single
     components."""
 
     def __init__(self, what: str, most: int = wp.config.max_unroll):
@@ -226,7 +227,7 @@ class DerivativeCheck(ast.NodeVisitor):
 
 
 def check_returns(what: str, function: ast.FunctionDef, kind: str) -> None:
-    """Raise `InputError` for a function that may end without returning anything."""
+    """Raise `InputError` for a function that may end without returning a value."""
     if not _returns(function.body):
         raise InputError(f"{what} may end without return, but must return a {kind}, whatever its arguments are.")
 
@@ -239,7 +240,7 @@ def _returns(body: list[ast.stmt]) -> bool:
 
 
 def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for unknown names, and for outside arrays and lists, which Warp functions cannot read."""
+    """Raise `InputError` for unknown names, and for outside arrays and lists."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Name) or node.id in own:
             continue
@@ -256,7 +257,7 @@ def counts_of(function: ast.FunctionDef) -> list[str]:
 
 
 class SizesWritten(ast.NodeTransformer):
-    """A rewriting of a function's text that replaces ``len(w)`` and ``w.shape[0]`` of arrays w by numbers."""
+    """Replaces ``len(w)`` and ``w.shape[0]`` of an array ``w`` by numbers in the source code of a function."""
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]]):
         self._shapes = shapes
@@ -276,7 +277,7 @@ class SizesWritten(ast.NodeTransformer):
 
 
 KEPT = ("builtins", "jax", "math", "numpy", "scipy", "torch", "warp")
-"""Packages that do not change: only the names of their functions and objects enter the meaning."""
+"""Packages that are assumed not to change."""
 PYTHON = sysconfig.get_path("stdlib")
 SNIPPETS = ("native_snippet", "adj_native_snippet", "replay_snippet")
 
@@ -286,8 +287,10 @@ def code_words(value: Any) -> str:
 
 
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
-    """Return lines that are equal in every process, and that differ if the value computes something else. For objects
-    and a user's modules they include only attributes in ``names``, by default all."""
+    """Return lines of text that identify what a value computes. The lines are equal in every process.
+
+    For objects and for a user's modules, ``names`` restricts the lines to these attributes.
+    """
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):
         return [repr(value)]

@@ -1,4 +1,4 @@
-"""Gravity: the same acceleration everywhere, one for each step."""
+"""Gravity, with one value for each step."""
 
 from functools import cache, cached_property
 

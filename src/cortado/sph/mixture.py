@@ -1,12 +1,12 @@
-"""The mass fractions c of a particle of several phases, and the rest density and viscosity that follow from them:
+"""The mass fractions of a particle's phases, and its rest density and viscosity:
 
-    1 / rho_0i = sum_k c_k,i / rho_0k,    ln mu_i = sum_k c_k,i ln mu_k    (Arrhenius 1887)
+    1 / rho = sum_k c_k / rho_k,    ln mu = sum_k c_k ln mu_k    (Arrhenius 1887)
 
-A particle's mass is constant; its rest volume follows from its rest density. The logarithms keep the viscosity positive
-if fractions stray out of [0, 1].
+Here c_k is the mass fraction of phase k, rho and rho_k are rest densities, and mu and mu_k are viscosities. The
+logarithms keep the viscosity positive if mass fractions leave the range from 0 to 1.
 
-The mixture step comes first in a step, with particles fixed at x(t): phases diffuse into one another, and particles get
-new densities and viscosities.
+Phases diffuse at the start of a step, with particles at fixed positions. Particles then get new densities and
+viscosities. The mass of a particle is constant.
 """
 
 from contextlib import nullcontext
@@ -31,14 +31,14 @@ def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool
 
 @cache
 def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNamespace:
-    """Make the kernels of a number of phases: ``order`` sorts and unsorts mass fractions, ``blend`` computes densities
-    and viscosities. Materials are arrays (members, phases)."""
+    """Make the kernels for a number of phases. ``order`` sorts mass fractions, and ``blend`` computes densities and
+    viscosities. Properties of phases are arrays (members, phases)."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
     @wp.func
     def logarithm(viscosity: real) -> real:
-        """Return ln(mu + tiny), finite for a viscosity mu of 0."""
+        """Return the logarithm of a viscosity, finite for a viscosity of 0."""
         return wp.log(viscosity + tiny)
 
     materials = {numbers: "rest_density viscosity", wp.array(dtype=fractions): "c_scene"}
@@ -96,7 +96,6 @@ class Phases:
     count: int
     diffusion: Diffusion | None
     strength: float
-    """alpha of the free energy [-]."""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Mixture":
         return Mixture(self, layout, requires_grad)
@@ -133,7 +132,7 @@ class MixtureAdjoint(PartAdjoint):
         self._y, self._z = part.fractions(), part.fractions()
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Turn the adjoint of the new fractions, in scene order, into that of the old fractions."""
+        """Convert the adjoint of the new mass fractions to the adjoint of the old mass fractions, in scene order."""
         with step.aside() if not self.part.substeps else nullcontext():
             self._unmix(step, bar, state_bar.mass_fractions)
 
@@ -154,8 +153,6 @@ class MixtureAdjoint(PartAdjoint):
 
 
 class Mixture(Part):
-    """The part of a step for the composition of particles."""
-
     derivatives = MixtureTangent, MixtureAdjoint
 
     def __init__(self, phases: Phases, layout: Layout, requires_grad: bool = False):
@@ -170,11 +167,11 @@ class Mixture(Part):
         self._layout = layout
         self._options = {"device": layout.device, "requires_grad": requires_grad}
         self.c: list[wp.array] = []
-        """Sorted fractions (n,) before each substep of diffusion."""
+        """Mass fractions of sorted particles before each diffusion substep (n,)."""
         self.chi: list[wp.array] = []
-        """Chemical potentials (n,) of each substep [-]."""
+        """Chemical potentials of each substep (n,) [-]."""
         self.w: list[wp.array] = []
-        """m M (n,) of each substep [kg / (m s)]."""
+        """Density times mobility of each substep (n,) [kg / (m s)]."""
 
     def fractions(self) -> wp.array:
         dtype = self._layout.precision.fractions(self.phases.count)

@@ -1,9 +1,7 @@
-"""The second moment M = -V sum_j grad W_ij x_ij^T of a particle's neighbours, whose inverse corrects gradients (Bonet
-and Lok 1999), and the fullness of a neighbourhood.
+"""The second moment matrix of a particle's neighbours, and the fullness of the neighbourhood.
 
-With the invariants I_2 and I_3 of M, the fullness is H = 3 I_3 / I_2, in the plane 2 det M / tr M: 1 inside, about 0.6
-at a flat surface, and 0 where neighbours lie on a line or are missing. On a line I_2 and I_3 are pure round-off;
-`ROUNDING` (tr M)^2 is added to I_2 so that H is 0.
+The inverse of the matrix corrects gradients (Bonet and Lok 1999). The fullness is a number from the invariants of the
+matrix: 1 inside the fluid, about 0.6 at a flat surface, and 0 if neighbours lie on a line or are missing.
 """
 
 from functools import cache
@@ -17,7 +15,7 @@ from cortado.device.modules import by_name
 from cortado.device.precision import FLOAT32, Precision
 
 ROUNDING = 64.0
-"""Multiple of (tr M)^2 that is added to I_2, in units of the last place of 1."""
+"""Regularisation of the fullness against round-off, in units of the last place."""
 
 
 @cache
@@ -33,8 +31,8 @@ def cross_terms_function(precision: Precision) -> Any:
 
 @cache
 def symmetric(precision: Precision) -> SimpleNamespace:
-    """Make functions of symmetric matrices stored as six numbers: diagonal and entries yz, xz and xy. ``kind`` is the
-    Warp type, ``pack`` converts a 3 x 3 matrix, ``times`` is the product with a vector."""
+    """Make Warp functions of symmetric matrices. A matrix is stored as the diagonal and the entries yz, xz and xy.
+    ``kind`` is the Warp type, ``pack`` converts a 3 x 3 matrix, and ``times`` multiplies by a vector."""
     vector, matrix, six = precision.vector, precision.matrix, precision.six
 
     @wp.func
@@ -65,12 +63,11 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def whole(diagonal: vector, others: vector) -> matrix:
-        """Return M from its diagonal and its other entries; in the plane M_zz is 1, without effect in the plane."""
+        """Return the matrix with this diagonal and these other entries."""
         return change(diagonal + vector(real(0.0), real(0.0), plane), others)
 
     @wp.func
     def fullness(M: matrix) -> real:
-        """Return H; ``tiny`` avoids 0 / 0 for particles without neighbours, where H is 0."""
         product = M[0, 0] * M[1, 1] + M[1, 1] * M[2, 2] + M[2, 2] * M[0, 0]
         I_2 = product - M[0, 1] * M[0, 1] - M[1, 2] * M[1, 2] - M[0, 2] * M[0, 2]
         I_3, trace = wp.determinant(M), wp.trace(M)
@@ -78,7 +75,6 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def inverse(M: matrix) -> matrix:
-        """Return M^-1 by cofactors: the derivative of the determinant with respect to M must not be 0."""
         a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
         b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
         c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
@@ -97,5 +93,5 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 def round_off(precision: Precision) -> float:
-    """Return the ratio |r| / first |r| below which a solve improves no further."""
+    """Return the relative residual at which an iterative solve reaches round-off."""
     return 3e-7 if precision is FLOAT32 else 1e-14

@@ -1,25 +1,19 @@
-"""Solids that move: a part of a step that puts walls of solids with prescribed paths where they are at its end; and the
-motion of free bodies by their momenta, with held axes and hinges.
+"""Solids with a prescribed path, and the motion of free bodies by their momenta, with fixed axes and hinges.
 
-A free body's velocities are V = D (V_0 + dt g + F / (rho K)) + W x s and W = G L. D is 0 along held axes. A hinge is at
-the arm a from the centre of mass in the body's frame, so that the centre is at s = - R a from the hinge. The hinge does
-not move: D is 0, L is the angular momentum and I the inertia about the hinge. Without a hinge s is 0.
+A free body changes its velocity only along free axes, and its angular velocity only about free axes. A body on a hinge
+turns about the hinge: its inertia and its angular momentum are about the hinge, and its centre of mass moves with the
+rotation.
 
-G is the inverse of the inertia J = R I R^T on the free axes A, G = A (A^T J A)^-1 A^T: J^-1 if all are free; a a^T /
-(a^T J a) for one axis a; J^-1 - (J^-1 b) (J^-1 b)^T / (b^T J^-1 b) if only b is held; 0 if none is free. The part of an
-initial angular velocity along held axes is ignored.
+A solid with a prescribed path starts at its initial pose, and is displaced and turned by the path. The velocity of a
+wall particle is its displacement in a step divided by the time step. States contain the position, the rotations and the
+scale of a solid (`cortado.particles.moving_walls`).
 
-A solid begins at the position c_0 with the rotation R(w_0). At the end of a step it is displaced by d and turned by w.
-A wall particle with the place r in its frame is then at c_0 + d + R(w) R(w_0) r. The velocity of the wall particle is
-its displacement in the step divided by the time step. States contain the position c, the turn w, w_0, and the scale
-(`cortado.particles.moving_walls`).
+Rotations are rotation vectors (Rodrigues), in 2-D angles. If the rotation vector w changes by a small vector u, the
+rotation is followed by the small rotation J u with the Jacobian
 
-A rotation R(w) by the vector w, in the plane by an angle, turns by |w| about w (Rodrigues). If w changes by w', the
-rotation turns further by J(w) w', as R(w + w') = R(J(w) w') R(w) to first order, with
+    J = I + (1 - cos |w|) / |w|^2 [w] + (|w| - sin |w|) / |w|^3 [w]^2,
 
-    J(w) = I + (1 - cos |w|) / |w|^2 [w] + (|w| - sin |w|) / |w|^3 [w]^2,
-
-in which [w] u is the cross product w x u; J(w)^T is J(-w).
+where I is the unit matrix and [w] the matrix of the cross product with w.
 """
 
 from collections.abc import Mapping
@@ -45,8 +39,9 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 @cache
 def hold_type(precision: Precision) -> Any:
-    """Return the Warp struct of a hold. ``moving`` is 1 along axes along which the body may move, 0 along others, and
-    ``arm`` is a [m]. ``turning`` axes of rotation are free; ``axis`` is the only one, or of two the held one."""
+    """Return the Warp struct of a body's degrees of freedom. ``moving`` is 1 along axes of free motion, else 0. ``arm``
+    is the vector from the centre of mass to the hinge [m]. ``turning`` is the number of free axes of rotation, and
+    ``axis`` the free axis if ``turning`` is 1 or the fixed axis if ``turning`` is 2."""
     vectors = dict.fromkeys(("moving", "arm", "axis"), precision.vector)
     return struct_of("HoldNumbers", precision, **vectors, turning=wp.int32)
 
@@ -61,8 +56,12 @@ def hold_numbers(hold: Hold, precision: Precision) -> Any:
 
 @cache
 def hold_functions(precision: Precision) -> SimpleNamespace:
-    """Make the Warp functions of a hold h: ``freed``, the part of an angular velocity w along free axes; ``rate``, R A
-    R^T w of matrices R and A; ``spin``, G L; and ``root``, S T with S^T S = G, by a square root of I^-1."""
+    """Make the Warp functions of a body's degrees of freedom.
+
+    ``freed`` returns the part of an angular velocity about free axes. ``rate`` transforms a matrix by a rotation and
+    multiplies it by a vector. ``spin`` returns the angular velocity for an angular momentum. ``root`` multiplies a
+    vector by a square root of the inverse inertia.
+    """
     vector, matrix, hold = precision.vector, precision.matrix, hold_type(precision)
 
     @wp.func
@@ -109,15 +108,14 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
 
 
 def free_module(precision: Precision, topic: str = "bodies") -> Any:
-    """Return the Warp module of kernels of free bodies that need no smoothing kernel. Kernels for some bodies need a
-    separate ``topic``, because Warp recompiles a module if its kernels differ."""
+    """Return the Warp module for kernels of free bodies. Use a separate ``topic`` for kernels that only some bodies
+    need, because Warp recompiles a module if its kernels differ."""
     return kernel_module(f"free_{topic}_derivative_{precision.name}")
 
 
 @cache
 def move_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of V, L and W of a body by gravity and by the momenta it gets, with a thread for each scene. The
-    kernels also compute the changes V - V_0 and W - W_0, ``faster`` and ``turned_faster``."""
+    """Make the kernels that move a rigid body by gravity and by its momenta."""
     real, vector, matrix, hold = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, vectors = hold.spin, "gravity V W L pulled twisted"
 
@@ -155,7 +153,8 @@ SMALL = 1e-3
 
 @cache
 def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the type ``angle``, numbers in 2 dimensions and vectors in 3, and the Warp function ``rotation``, R(w)."""
+    """Make the Warp type ``angle``, a number in 2-D and a vector in 3-D, and the Warp function ``rotation``, which
+    returns the rotation matrix."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
@@ -188,7 +187,7 @@ def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func_grad(rotation)
     def rotation_adjoint(turn: vector, adj_ret: matrix):
-        """Apply J(w)^T, which is J(-w): Warp's adjoint would be 0 at 0."""
+        """Apply the transposed Jacobian of a rotation. Warp's generated adjoint would be 0 at angle 0."""
         wp.adjoint[turn] += further(-turn, turning(rotation(turn), adj_ret))
 
     angle, found = (real, about_z) if dimension == 2 else (vector, rotation)
@@ -200,8 +199,8 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 
 @cache
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make kernels of a moving solid in 2 or 3 dimensions, with a thread for each scene: its poses before and after a
-    step, and its state at the end. Adjoints of the two states share their arrays."""
+    """Make the kernels of a moving solid in 2 or 3 dimensions: for its poses before and after a step, and for its
+    state."""
     real, vector, matrix, of = precision.real, precision.vector, precision.matrix, rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
@@ -276,7 +275,7 @@ class MovingSolidsAdjoint(PartAdjoint):
 
 
 class MovingSolidsPart(Part):
-    """The part of a step that puts the walls of moving solids where they are at its end, also those of other parts."""
+    """The part of a step that moves the walls of moving solids."""
 
     derivatives = MovingSolidsTangent, MovingSolidsAdjoint
 

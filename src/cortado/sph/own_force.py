@@ -1,18 +1,8 @@
-"""Forces and viscosity laws that a user gives as one Python function.
+"""User-defined forces and viscosity laws, each given as one Python function.
 
-`Body` is the acceleration a_i = f(x_i, v_i, t, theta) [m/s2] of each particle. The exact adjoint is Warp's gradient of
-the scalar product of f and a_bar; the exact tangent is the sum of the gradients of the components of f.
-
-`Pair` is a force between neighbours: the force [N], in 2-D per metre, on a particle from each neighbour within the
-support is (W(x_ij) / W(0)) f(x_ij, v_ij, t, theta), so that
-
-a_i = 1 / (m_i s^d) sum_j (W_ij / W_0) f(x_ij, v_ij, t, theta)
-
-ends smoothly at the support; m_i s^d is the mass of a particle, with the spacing s. Momentum is conserved if f is odd,
-f(-x, -v) = -f(x, v), and angular momentum if f is also parallel to x. A particle exerts no such force on itself, and
-walls exert none.
-
-`Rheology` is the viscosity of a generalised Newtonian fluid, whose viscous force is a stress.
+`Body` is an acceleration of each particle. `Pair` is a force between neighbours, which is multiplied by the smoothing
+kernel and therefore ends smoothly at the support radius. `Rheology` is the viscosity of a generalised Newtonian fluid.
+Tangents and adjoints are exact, from Warp's derivatives of the function.
 """
 
 from abc import ABC, abstractmethod
@@ -47,14 +37,16 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 
 class OverTime:
-    """A parameter of a force that changes in time: linear between the given times, constant before the first and after
-    the last. A step uses the value at its middle; a search may use one value for each step.
+    """A parameter of a force that changes in time. It is linear between the given times, and constant before the first
+    and after the last time.
+
+    A step uses the value at its middle. A search may use one value for each step.
 
     Example: ``k = cortado.forces.OverTime([0.0, 0.5], [2.0, 8.0])``
     """
 
     def __init__(self, times: Any, values: Any):
-        """Take ``times`` (k,) [s], each greater than the one before, and ``values`` (k,) or (k, d) at these times."""
+        """Take increasing ``times`` (k,) [s] and ``values`` (k,) or (k, d)."""
         self.times, self.values = read_only("OverTime times", times), read_only("OverTime values", values)
         if self.times.ndim != 1 or not self.times.size or not np.isfinite(self.times).all():
             raise InputError(f"OverTime times are {shown(times)}, but must be a list of finite times [s].")
@@ -71,25 +63,28 @@ class OverTime:
         return f"OverTime({self.times.tolist()}, {self.values.tolist()})"
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Return the parameter's values at times (n,) [s]."""
+        """Return the values at ``times`` (n,) [s]."""
         return self._course.at(times)
 
     def rates(self, times: np.ndarray) -> np.ndarray:
-        """Return the parameter's derivatives with respect to time at times (n,) [s]."""
+        """Return the time derivatives at ``times`` (n,) [s]."""
         return self._course.rates(times)
 
 
 @fixed
 class OwnFunction(ABC):
-    """A force, for `Simulation`, whose formula is one Python function; see `cortado.forces`."""
+    """Base class of user-defined forces that are given as one Python function; see `cortado.forces`."""
 
     kind: ClassVar[str]
     """Name of the kind of force in messages."""
 
     def __init__(self, function: Callable[..., Any], /, name: str | None = None, **parameters: Any):
-        """Take a ``function`` defined by ``def``, and ``parameters``: values for all of its arguments after the inputs.
-        A value is a number, a vector (d,) or an `OverTime`; `Body` takes arrays too. An argument ``k`` becomes the
-        parameter ``name.k``; the default name is the function's. Raises `InputError`."""
+        """Take a ``function`` defined by ``def``, and values for the ``parameters`` of the function.
+
+        A value is a number, a vector (d,) or an `OverTime`; for `Body` also an array. The function's argument ``k``
+        becomes the parameter ``name.k``. The default ``name`` is the name of the function. Raises `InputError` for an
+        invalid function or value.
+        """
         self._function = plain_function(self.kind, function)
         self._source = source_of(f"{self.kind} function {self._function.__name__}", self._function)
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
@@ -111,7 +106,7 @@ class OwnFunction(ABC):
 
     @property
     def fingerprint(self) -> str:
-        """Return a hash of the function's text, and of the functions that it calls."""
+        """Return a hash of the source code of the function and of the functions that it calls."""
         courses = [repr(value) for value in self._values.values() if isinstance(value, OverTime)]
         words = (self.kind, self.name, self._formula.text, self._formula.outside, *courses)
         return sha256("\n".join(words).encode()).hexdigest()
@@ -131,7 +126,7 @@ class OwnFunction(ABC):
 
     @abstractmethod
     def force(self, setting: Setting) -> Force:
-        """Make the force in a solver; raise `InputError` for a function that Warp cannot compile."""
+        """Make the force in a solver. Raise `InputError` for a function that Warp cannot compile."""
 
     @property
     def _what(self) -> str:
@@ -139,7 +134,6 @@ class OwnFunction(ABC):
 
     @property
     def _ranks(self) -> tuple[int, ...]:
-        """The ranks of time, if the function takes time, and of the parameters except arrays."""
         return tuple(p.rank for p in self.parameters if p.axis is not Axis.ARRAY)
 
 
@@ -148,7 +142,7 @@ class OwnForce(OwnFunction):
     """Function that makes the kernels of the force in 2 or 3 dimensions."""
 
     def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
-        """Make the kernels of the force in a scene of 2 or 3 dimensions with a number of phases."""
+        """Make the kernels of the force."""
         return type(self)._made_by(discretisation, self._formula.of_phases(self._what, phases), self._ranks, dimension)
 
     def force(self, setting: Setting) -> "FunctionForce":
@@ -266,14 +260,15 @@ FIELDS = {
     "velocity_gradient": ("gradient(M_i, A_i)", ("M_i", "A_i")),
     "shear_rate": ("rate(M_i, A_i)", ("M_i", "A_i")),
 }
-"""A particle's quantities that a function may take, with source texts in a kernel, and the array entries therein."""
+"""Particle quantities that a function may take as arguments, with their source code in kernels."""
 
 
 class Body(OwnForce):
-    """A force on each particle: ``function(x, v, t, ...)`` returns the acceleration [m/s2] of a particle from its
-    position [m], its velocity [m/s] and the time [s]. The time may be left out. Further arguments with these names are
-    quantities of the particle: ``density`` [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient``
-    [1/s].
+    """A force on each particle. ``function(x, v, t, ...)`` returns the acceleration [m/s2] of a particle from its
+    position [m], its velocity [m/s] and the time [s].
+
+    The argument ``t`` may be left out. Arguments with these names are quantities of the particle: ``density`` [kg/m3],
+    ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]. All other arguments are parameters.
 
     Example::
 
@@ -314,10 +309,12 @@ def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
 
 
 class Pair(OwnForce):
-    """A force between neighbours: ``function(x_ij, v_ij, t, ...)`` returns the force [N], in 2-D per metre, on a
-    particle from a neighbour. x_ij [m] and v_ij [m/s] are the particle's position and velocity relative to the
-    neighbour. The time may be left out. The force is multiplied by W(x_ij) / W(0), which is 1 at distance 0 and 0 at
-    the support. Momentum is conserved if f(-x, -v) = -f(x, v). Walls exert no such force.
+    """A force between neighbours. ``function(x_ij, v_ij, t, ...)`` returns the force [N], in 2-D per metre of depth, of
+    a neighbour on a particle.
+
+    ``x_ij`` [m] and ``v_ij`` [m/s] are the particle's position and velocity relative to the neighbour. The time ``t``
+    may be left out. The force is multiplied by a weight that falls from 1 at distance 0 to 0 at the support radius.
+    Momentum is conserved if f(-x, -v) = -f(x, v) for the function f. Walls exert no force of this kind.
 
     Example::
 
@@ -331,9 +328,11 @@ class Pair(OwnForce):
 
 
 class Rheology(OwnFunction):
-    """A law of viscosity: ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate sqrt(2
-    D : D) [1/s]. The argument ``viscosity`` [Pa s] is the viscosity of the phase; D is the symmetric velocity gradient.
-    The force by this law replaces the viscous force of the scene, whose key ``viscosity`` must be "stress".
+    """A law of viscosity. ``function(shear_rate, viscosity, ...)`` returns the viscosity [Pa s] at a shear rate [1/s].
+    The shear rate is sqrt(2 D : D), where D is the symmetric part of the velocity gradient.
+
+    The argument ``viscosity`` [Pa s] is the viscosity of the phase. The law replaces the viscous force of the scene,
+    which must have the form "stress".
 
     Example::
 
@@ -345,11 +344,11 @@ class Rheology(OwnFunction):
 
     kind = "Rheology"
     replaces = "cortado.sph.viscosity"
-    """The module of the scene's force that this law replaces."""
+    """Module of the scene's force that this law replaces."""
 
     def force(self, setting: Setting) -> ViscousStress:
-        """Make the viscous force with this law. Raise `InputError` if Warp cannot compile the function, or if a
-        viscosity that the function returns is negative or not finite."""
+        """Make the viscous force with this law. Raise `InputError` if Warp cannot compile the function, or if the
+        function returns a negative or infinite viscosity."""
         if setting.scene.forces.viscosity != "stress":
             found = f"forces.viscosity is {setting.scene.forces.viscosity!r}"
             raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")
@@ -359,7 +358,7 @@ class Rheology(OwnFunction):
         return made
 
     def check(self, values: Arrays, simulation: Any) -> None:
-        """Raise `InputError` where the law returns no valid viscosity with these values of parameters, by name."""
+        """Raise `InputError` if the law returns an invalid viscosity for the parameter ``values``."""
         if "viscosity" in values or any(one.name in values for one in self.parameters):
             self._try(values, simulation.scene, simulation.precision, simulation.device)
 
@@ -375,7 +374,6 @@ class Rheology(OwnFunction):
         check_law(self._what, self._law(scene), viscosities, thetas, precision, device)
 
     def _thetas(self, values: Arrays, time_step: float) -> np.ndarray:
-        """Return the function's parameters (k, numbers) at every time at which one of them changes."""
         known = {one.name: one for one in self.parameters}
         own = {name: values.get(f"{self.name}.{name}", value) for name, value in self._values.items()}
         steps = max((len(v) for n, v in values.items() if n in known and v.ndim > known[n].rank), default=0)

@@ -1,18 +1,15 @@
-"""The parts of a step, such as forces, the mixture and the nozzle: their arguments, and the order in which a step calls
-them.
+"""The parts of a step, such as forces, the mixture and emitters, and the order of their methods.
 
-A part reads the sorted particles and the parameters, adds to adjoints, and never overwrites its arguments. Besides
-accelerating particles, a part may keep fields from step to step, and act at the beginning and end of a step. A part may
-omit any method.
+A part reads the sorted particles and the parameters, and must not overwrite them. It can accelerate particles, keep
+fields from step to step, and act at the beginning and end of a step. A part may omit any method.
 
-For each method a step calls all parts in their order, reverse mode in reverse order. In `begin` kernels can read the
-parameters and the number of the step; from `sort` on also the order of particles and x, v and m; from `settle` on
-neighbours and n; in `end` all arrays of the step. A derivative replays a step from its state without `end`, so the
-other methods must store all values that tangent or adjoint need.
+A step calls each method for all parts, one part after the other; reverse mode uses the reverse order. In `begin`,
+kernels can read the parameters and the number of the step. From `sort` on they can also read positions, velocities and
+masses, from `settle` on neighbours and densities, and in `end` all arrays of the step. A derivative repeats a step
+without `end`. The earlier methods must therefore store all values that tangent or adjoint need.
 
-A state stores particles in the scene's order, and a step works on sorted particles. The adjoint of sorting is
-unsorting. At the end of this module are the kernels of time integration (semi-implicit Euler) and of sorting, with
-derivatives.
+A state stores particles in the order of the scene, and a step works on sorted particles. At the end of this module are
+the kernels of time integration (semi-implicit Euler) and of sorting, with derivatives.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -42,9 +39,12 @@ from cortado.scene.scene import Scene
 
 @dataclass(frozen=True)
 class StepContext:
-    """A step as its parts see it. Kernels find in the context, by name, the fields of the particles, the parameters,
-    the neighbourhood ``s``, ``order`` (sorted -> scene), the number ``step`` (members,) of the step, and ``cell``, the
-    volume of a particle [m^d]. In a batch particle i belongs to scene i // ``particles``."""
+    """The current step, with all arrays that its parts may read.
+
+    Kernels find arguments in the context by name: the fields of the particles and the parameters. They also find the
+    neighbourhood ``s``, ``order`` (from sorted to scene order), the number ``step`` (members,) of the step, and the
+    volume ``cell`` of a particle [m^d]. In a batch particle i belongs to scene i // ``particles``.
+    """
 
     launcher: KernelLauncher
     particles: int
@@ -57,7 +57,7 @@ class StepContext:
     parameters: Parameters
     bodies: Sequence[Any] = ()
     kick: wp.array | None = None
-    """(n,) velocity changes of sorted particles by pressure in the previous step [m/s]; None if not carried."""
+    """Velocity changes of sorted particles by pressure in the previous step (n,) [m/s], or None."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -65,19 +65,21 @@ class StepContext:
         return {**own, "cell": self.cell, "fractions": self.fractions}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        """Launch a kernel over the particles; the step has the arguments missing from ``arguments`` and ``groups``.
+        """Launch a kernel over the particles. The context provides all arguments that are not in ``arguments`` or
+        ``groups``.
 
-        A kernel that takes ``s`` takes it first and works on particle ``s.first + wp.tid()``, because its launch may be
-        split into ranges of particles. ``threads`` is for kernels without ``s``.
+        A kernel with the argument ``s`` takes it first, and works on particle ``s.first + wp.tid()``, because its
+        launch may be split into ranges of particles. ``threads`` is for kernels without ``s``.
         """
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
     def aside(self) -> AbstractContextManager[None]:
-        """Let the launches inside run concurrently with later launches until `join`; both must be independent."""
+        """Let the launches inside this context manager run concurrently with later launches, until `join` is called.
+        The launches must not depend on each other."""
         return self.launcher.aside()
 
     def join(self) -> None:
-        """Let later launches wait for all launches made `aside`; every step ends with this call."""
+        """Let later launches wait for all launches made in `aside`. Every step must end with this call."""
         self.launcher.join()
 
 
@@ -96,11 +98,11 @@ class Tangents:
 
 
 class Shares(Arrays):
-    """Terms (n,) of the particles in the adjoints of parameters, stored until they are summed: numbers or vectors, and
-    for a parameter of phases a number for each phase."""
+    """Terms of particles in the adjoints of parameters (n,), before summation."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
-        """Allocate terms of the parameters ``names``, all 0; raise `TypeError` for a parameter without such terms."""
+        """Allocate terms of the parameters ``names``, all 0. Raise `TypeError` for a parameter that particles do not
+        share."""
         precision, self.known = layout.precision, layout.known
         of_phases = precision.fractions(layout.phases)
         dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
@@ -124,7 +126,7 @@ class Shares(Arrays):
 class Adjoints:
     fields: Fields
     fractions: wp.array
-    """Adjoint of `StepContext.fractions`, which the mixture turns into that of the old fractions and sets to 0."""
+    """Adjoint of the mass fractions after diffusion, `StepContext.fractions`."""
     parameters: Parameters
     shares: Shares
     solids: SolidShares
@@ -133,8 +135,11 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """Return adjoints by kernel argument name, such as ``x_bar``: sums (members, steps) of parameters over time,
-        and the particles' terms of parameters in a part's ``shares``."""
+        """Return the adjoints by kernel argument name, such as ``x_bar``.
+
+        Adjoints of parameters over time are sums (members, steps). Adjoints of parameters in ``shares`` are terms of
+        particles.
+        """
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         fractions = {"fractions_bar": self.fractions}
@@ -143,8 +148,8 @@ class Adjoints:
 
 @dataclass(frozen=True)
 class Setting:
-    """The arguments from which a force is made. A module named in the registry of parameters has a function
-    ``force(setting)``, which returns its force, or None without one."""
+    """The arguments for making a force. A module of a force has a function ``force(setting)``, which returns the force
+    or None."""
 
     scene: Scene
     discretisation: Discretisation
@@ -154,28 +159,32 @@ class Setting:
 
 
 class Force(Protocol):
-    """An explicit force. A step adds up the accelerations [m / s2] of its forces, one after the other. ``batches =
-    True`` declares that the force runs in batches: its kernels read, for particle i, the parameters of scene i //
-    particles."""
+    """Protocol of an explicit force. A step adds up the accelerations [m / s2] of all forces.
+
+    ``batches = True`` declares that the force supports batches. Its kernels then read, for particle i, the parameters
+    of scene i // particles.
+    """
 
     shares: tuple[str, ...]
-    """Parameters, numbers or per phase, to whose adjoints every particle adds a term. An adjoint kernel gets these
-    adjoints per particle, (n,), those of parameters over time as sums, (members, steps), and no others."""
+    """Names of parameters with adjoints that are sums over particles. Adjoint kernels write a term for each particle
+    (n,). Parameters over time have sums (members, steps) instead."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        """Write ``after`` = ``before`` + this force's acceleration, both (n,) vectors."""
+        """Write the sum of ``before`` and this force's acceleration to ``after``. All three are (n,) vectors."""
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        """Write ``after`` = ``before`` + the tangent of this force's acceleration along ``dot``, both (n,) vectors."""
+        """Write the sum of ``before`` and the tangent of this force's acceleration to ``after``. All three are (n,)
+        vectors."""
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
         """Add to the adjoints ``bar`` of the force's inputs, given the adjoint of the acceleration, (n,) vectors.
 
-        A force whose acceleration depends on ``before`` has ``is_last = True``, comes after all others, and returns the
-        adjoint of ``before``. A force that solves a system has the solver as its attribute ``solve``, see
-        `cortado.solvers.loop`. A force by which walls act on fluid has a `cortado.sph.density.WallAction` as
-        ``wall_action``; without it, loads on solids lack this force. If walls act at x_i - y instead of at the
-        particle, ``wall_couple`` is a second `WallAction`: the sum of y x a.
+        A force with an acceleration that depends on ``before`` has ``is_last = True``, comes last, and returns the
+        adjoint of ``before``. A force that solves a system has the attribute ``solve``; see `cortado.solvers.loop`.
+
+        A force of walls on fluid has the attribute ``wall_action``, a `cortado.sph.density.WallAction`. Without this
+        attribute, loads on solids do not include the force. If walls act at the surface instead of at the particle
+        position, ``wall_couple`` is a second `WallAction` for the moment.
         """
 
 
@@ -184,15 +193,13 @@ class PartTangent:
         self.part = part
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangent of `Part.begin` to the tangent of the state before the step."""
+        """Apply the tangent of `Part.begin`, given the tangent of the state before the step."""
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangents of `Part.sort` and `Part.settle`; ``state_dot`` is the tangent of the state before the
-        step."""
+        """Apply the tangents of `Part.sort` and `Part.settle`, given the tangent of the state before the step."""
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Apply the tangent of `Part.end`: ``state_dot`` contains the tangents of positions and velocities at the end
-        of the step, and becomes the tangent of the state there."""
+        """Apply the tangent of `Part.end`, and complete ``state_dot``, the tangent of the state after the step."""
 
 
 class PartAdjoint:
@@ -200,52 +207,52 @@ class PartAdjoint:
         self.part = part
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Apply the adjoint of a part with a `Part.target`: turn the adjoint of positions and velocities after the part
-        into that before the part, return it, and add to ``bar``. Sorted particles have no adjoints yet."""
+        """Apply the adjoint of `Part.end` to the adjoints of positions and velocities. Return the adjoints before the
+        part acts, and add to ``bar``. Only a part with a `Part.target` has this method."""
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Apply the adjoints of `Part.settle` and `Part.sort`, and of the sorted particles in `Part.end`. Replace in
-        ``state_bar`` the adjoint of the part's fields after the step by the adjoint before it."""
+        """Apply the adjoints of `Part.settle` and `Part.sort`. In ``state_bar``, replace the adjoint of the part's
+        fields after the step by the adjoint before the step."""
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Apply the adjoint of `Part.begin`, after all others."""
+        """Apply the adjoint of `Part.begin`, after all other adjoints."""
 
 
 class Part:
-    """A part of a step, in one solver. A `Force` may be a part too."""
+    """A part of a step. A `Force` may also be a part."""
 
     fields: tuple[StateField, ...] = ()
-    """Fields that the part keeps from step to step, as arrays of the state."""
+    """State fields that the part keeps from step to step."""
     shares: tuple[str, ...] = ()
-    """Parameters to whose adjoints every particle adds a term; see `Force.shares`."""
+    """Names of parameters with adjoints that are sums over particles; see `Force.shares`."""
     derivatives: tuple[type[PartTangent], type[PartAdjoint]] | None = None
-    """Classes of the part's tangent and adjoint, made of the part; None if the part has none or makes them itself."""
+    """Classes of the part's tangent and adjoint, or None."""
 
     def set_substeps(self, substeps: int) -> None:
-        """Take this number of substeps of diffusion in each later step."""
+        """Set the number of diffusion substeps for later steps."""
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Begin a step from its first state, which must not change. Copy the arrays of this state that `end` needs: the
-        state at the end of the step may be in the same arrays."""
+        """Begin a step. ``state`` is the state before the step and must not be changed. Copy arrays that `end` needs,
+        because the step may overwrite them."""
 
     def sort(self, step: StepContext, state: State) -> None:
-        """Act once the order of the sorted particles is known."""
+        """This method is called when the particles are sorted."""
 
     def settle(self, step: StepContext) -> None:
-        """Act once neighbours and densities are known."""
+        """This method is called when neighbours and densities are known."""
 
     def target(self, moved: State) -> State:
-        """Return the state from which the part's `end` reads positions and velocities; `end` writes them to ``moved``.
-        A part that changes them returns a separate state, because nothing is changed in place."""
+        """Return the state from which `end` reads positions and velocities. A part that changes positions or velocities
+        must return a new state, because arrays must not be changed in place."""
         return moved
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
-        """Write the part's fields of ``state``, the state at the end of the step. A part with a separate `target` reads
-        positions and velocities there and writes them all to ``moved``."""
+        """Write the part's fields to ``state``, the state after the step. A part with a new `target` also writes all
+        positions and velocities to ``moved``."""
 
     def new_tangent(self) -> PartTangent:
-        """Make the tangent of the part, with its arrays; raise `MissingDerivativeError` without forward mode."""
+        """Make the tangent of the part. Raise `MissingDerivativeError` without forward mode."""
         if self.derivatives is None:
             raise MissingDerivativeError(
                 f"{type(self).__name__} has no forward mode: let it have a method new_tangent."
@@ -253,7 +260,7 @@ class Part:
         return self.derivatives[0](self)
 
     def new_adjoint(self) -> PartAdjoint:
-        """Make the adjoint of the part, with its arrays; raise `MissingDerivativeError` without reverse mode."""
+        """Make the adjoint of the part. Raise `MissingDerivativeError` without reverse mode."""
         if self.derivatives is None:
             raise MissingDerivativeError(
                 f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint."
@@ -263,14 +270,14 @@ class Part:
 
 class PartMaker(Protocol):
     def part(self, layout: Layout, requires_grad: bool) -> Part:
-        """Make the part for a solver; with ``requires_grad`` its arrays have gradients, for Warp's tape."""
+        """Make the part for a solver. With ``requires_grad``, its arrays have gradients for ``warp.Tape``."""
 
 
 class Carried:
-    """Fields of sorted particles, such as a pressure, that a solver carries from step to step, or their derivatives."""
+    """Fields of sorted particles that a solver uses in the next step, such as a pressure."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
-        """Allocate the fields' arrays; raise `TypeError` for a field without an entry for each particle."""
+        """Allocate the arrays of the fields. Raise `TypeError` for a field without an entry for each particle."""
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:
@@ -280,7 +287,7 @@ class Carried:
         self._arrays = layout.state(fields, requires_grad)
 
     def __getitem__(self, name: str) -> wp.array:
-        """Return a field's array (n,) in sorted order, as at the start of the step."""
+        """Return the array of a field at the start of the step, in sorted order (n,)."""
         return self._arrays[name]
 
     def sort(self, step: StepContext, state: State) -> None:
@@ -295,12 +302,12 @@ class Carried:
 
 
 def sort(step: StepContext, a_scene: wp.array, a: wp.array) -> None:
-    """Write the entries (n,) of an array in the scene's order to sorted particles."""
+    """Copy an array ``a_scene`` (n,) in the order of the scene to sorted order."""
     step.launch(_kernels(a).sort, a_scene=a_scene, a=a)
 
 
 def unsort(step: StepContext, a: wp.array, a_scene: wp.array) -> None:
-    """Write the entries (n,) of sorted particles to an array in the scene's order."""
+    """Copy an array ``a`` (n,) in sorted order to the order of the scene."""
     step.launch(_kernels(a).unsort, a=a, a_scene=a_scene)
 
 
@@ -329,13 +336,14 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Return the Warp module of kernels without a smoothing kernel, for a ``topic`` that only some scenes need."""
+    """Return the Warp module for kernels without a smoothing kernel. Use a separate ``topic`` for kernels that only
+    some scenes need."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
 @cache
 def prediction_share(precision: Precision) -> Any:
-    """Make the Warp function of the time step's adjoint by a prediction v* = v + dt a, x* = x + dt v*."""
+    """Make the Warp function of a particle's term in the adjoint of the time step."""
     real, vector = precision.real, precision.vector
 
     @wp.func
@@ -394,7 +402,7 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def begin_adjoint_kernel(precision: Precision) -> Any:
-    """Make the kernel that turns the adjoint of the new state, in scene order, into that of the prediction."""
+    """Make the kernel that converts the adjoint of the new state to the adjoint of the predicted state."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_share(precision)
     vectors = wp.array(dtype=vector)

@@ -1,21 +1,20 @@
-"""Springs that pull free bodies, and springs and motors that turn bodies about hinges.
+"""Springs of free bodies, and springs and motors at hinges.
 
-A spring leads from the point q = c + R p of a body to the point q' of another solid, or of the world. With the length l
-= |q' - q|, the unit vector n along the spring, the stiffness k, rest length l_0 and damping C, the tension is
+A spring connects a point of a free body to a point of a second solid or of space. Its tension is
 
-    t = k (l - l_0) + C n . (w' - w),
+    t = k (l - l_0) + C u,
 
-where w and w' are the velocities of both points. The body gets the momentum dt t n and its moment about the body's
-middle; the other solid gets the opposite. Forces use the poses at the start of a step, and the new velocities then move
-the bodies: symplectic Euler. Without damping, a spring of frequency omega has the period of arccos(1 - (omega dt)^2 /
-2) / dt, within (omega dt)^2 / 24, and dt must be at most 2 / omega.
+with the stiffness k, the length l, the rest length l_0, the damping C, and the rate of extension u. A slack spring only
+pulls: its tension is at least 0. The body gets the momentum of the tension in a time step, and the second solid gets
+the opposite momentum. Forces use the poses at the start of a step, and the new velocities then move the bodies
+(symplectic Euler). Without damping, the time step must be at most 2 / omega for a spring of angular frequency omega.
 
-A slack spring only pulls: t = max(k (l - l_0) + s C n . (w' - w), 0), with s from 0 at l_0 to 1 at 1.01 l_0, and t = 0
-below l_0. At the corner the derivative is one-sided.
+A body that is turned by the angle phi about a hinge gets the torque
 
-A body turned by the angle phi about a hinge with axis a gets the torque T - k (phi - phi_0) - C (a . (W - W') - s),
-with the motor's torque T and speed s; the other solid gets the opposite. If the hinge is at another solid, which turns
-with W', a and phi belong to the frame of that solid. At a half turn phi jumps from pi to -pi.
+    T - k (phi - phi_0) - C (r - s),
+
+with the motor's torque T, the stiffness k, the rest angle phi_0, the damping C, the angular velocity r about the hinge,
+and the motor's speed s. The second solid gets the opposite torque. At half a turn phi jumps from pi to -pi.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,8 +42,7 @@ POSES = (
     ("c", "e", "after", "after"),
     ("R", "E", "turns", "turned"),
 )
-"""Middles and rotations before and after a step: names in kernels for the body and for the other solid, and names of
-the arrays (`cortado.particles.moving_walls`) and of their changes."""
+"""Names of the poses before and after a step: kernel arguments for the two solids, and arrays."""
 TURNED = {name: f"{name}_turn" for name in ("R_0", "R", "E_0", "E")}
 
 
@@ -58,8 +56,8 @@ def constants_types(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of springs and hinges, with a thread for each scene: the momenta by a spring, its force and
-    length as components of a vector, and the angular momentum by a hinge."""
+    """Make the kernels of springs and hinges: for the momentum by a spring, for its force and length, and for the
+    angular momentum by a hinge."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     (spring_of, hinge_of), kinds = constants_types(precision), {vector: "c_0 c e_0 e W", matrix: "R_0 R E_0 E"}
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
@@ -67,7 +65,8 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
     @wp.func
     def tension(k: real, rest: real, c: real, dt: real, d: vector, moved: vector, slack: bool) -> real:
-        """Return t for the vector d between the ends; ``moved`` is its change, ``tiny`` is for ends that meet."""
+        """Return the tension of a spring. ``d`` is the vector between its ends, and ``moved`` the change of this vector
+        in a step."""
         length = wp.sqrt(wp.dot(d, d) + tiny)
         longer, rate = length - rest, wp.dot(d, moved) / (length * dt)
         found = k * longer + c * rate
@@ -131,7 +130,7 @@ class Springs:
         self._rest = resting_pose(layout)
 
     def ends(self, of: Ends | Joint) -> Named:
-        """Return the poses of both solids, and their tangents, by the names of kernel arguments."""
+        """Return the poses of the two solids and the tangents of the poses, by names of kernel arguments."""
         found: dict[str, wp.array] = {}
         each = self.part.made_of.walls.each
         pose, other_pose = each[self.number(of.body)], self._rest if of.against < 0 else each[of.against]
@@ -141,7 +140,7 @@ class Springs:
         return found
 
     def known(self, of: Ends | Joint) -> tuple[Named, ...]:
-        """Return the kernel arguments of a spring or hinge other than its parameters."""
+        """Return the kernel arguments of a spring or hinge, without its parameters."""
         precision, (spring_of, hinge_of) = self.layout.precision, constants_types(self.layout.precision)
         if isinstance(of, Ends):
             spring = spring_of()
@@ -159,7 +158,7 @@ class Springs:
     def each(
         self, step: StepContext, bodies: Sequence[FreeBody | Changes]
     ) -> Iterator[tuple[Kernels, Ends | Joint, Sequence[str], tuple[Named, ...]]]:
-        """Yield kernels, spring or hinge, names of its parameters, and kernel arguments with momenta of ``bodies``."""
+        """Yield the kernels, the spring or hinge, the names of its parameters, and its kernel arguments."""
         all_of: list[Ends | Joint] = [*self.springs, *self.turned]
         for of in all_of:
             kernels, ends = (self.pull, NUMBERS) if isinstance(of, Ends) else (self.twist, TURNING)
@@ -193,7 +192,7 @@ class SpringsTangent:
 
 
 class PoseBars:
-    """Adjoints of the poses of both solids, by the names of kernel arguments."""
+    """Adjoints of the poses of the two solids, by names of kernel arguments."""
 
     def __init__(self, springs: Springs):
         self._springs, layout = springs, springs.layout

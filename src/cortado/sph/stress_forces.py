@@ -1,17 +1,20 @@
-"""The sum over neighbours m_i a_i of the viscous stress (`cortado.sph.stress_kernels`), and laws of viscosity.
+"""The sum over neighbours in the viscous stress (`cortado.sph.stress_kernels`), walls without slip, and laws of
+viscosity.
 
-A wall without slip acts like a neighbour at rest at the point of its surface below the particle. With the normal n of
-the wall, the distance d of particle i from its surface, and a wall particle b at x_b,
+A wall without slip acts like a neighbour at rest at the surface point below the particle. With the normal n of the
+wall, the distance d of particle i from its surface, and a wall particle b at x_b,
 
     y_ib = d n,   s_w = w_b s_ib max(n . x_ib, 0) / max(d, e),
 
-for the weight s_ib of two fluid particles, as if velocities continued behind the wall with opposite sign (Morris, Fox
-and Zhu 1997). Behind the surface d is 0. Below the distance e, called ``least``, the pull of a wall does not increase
-further. The product n . x_ib is negative if b belongs to the other side of a thin wall, or to another face at an edge:
-such b are left out, because a negative weight would accelerate the particle. At these three limits the derivative
-jumps. n comes from the ``foot``, the vector from x_b to the surface.
+for the weight s_ib of two fluid particles. This is as if velocities continued behind the wall with opposite sign
+(Morris, Fox and Zhu 1997). Behind the surface d is 0. Below the distance e, called ``least``, the pull of a wall does
+not increase further.
 
-A viscosity law returns the viscosity of a fluid from its shear rate: a user's function, a law named in a scene
+The product n . x_ib is negative if b belongs to the other side of a thin wall, or to another face at an edge. These
+wall particles are left out, because a negative weight would accelerate the particle. At these three limits the
+derivative jumps. n comes from the ``foot``, the vector from x_b to the surface.
+
+A viscosity law returns the viscosity of a fluid from its shear rate. It is a user's function, a law named in a scene
 (`cortado.scene.model`), or the constant of a Newtonian fluid.
 """
 
@@ -43,12 +46,10 @@ def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def weight(x: vector, s: neighbourhood) -> real:
-        """Return s = -V a of a separation, with grad W = a x."""
         return -s.volume * slope(x, s)
 
     @wp.func
     def rise(x_ib: vector, foot: vector) -> real:
-        """Return n . x_ib."""
         return wp.dot(x_ib, foot) / wp.length(foot)
 
     @wp.func
@@ -61,12 +62,10 @@ def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def hold(x_ib: vector, foot: vector, least: real, s: neighbourhood) -> real:
-        """Return s_w / w_b."""
         return weight(x_ib, s) * wp.max(rise(x_ib, foot), real(0.0)) / wp.max(height(x_ib, foot), least)
 
     @wp.func
     def fall_change(x_ib: vector, u: vector, foot: vector) -> vector:
-        """Return the derivative of y along a change u of x, which is symmetric."""
         square = wp.dot(foot, foot)
         return wp.where(height(x_ib, foot) > real(0.0), wp.dot(u, foot) / square, real(0.0)) * foot
 
@@ -84,8 +83,7 @@ def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace:
-    """Make the sums ``force`` and ``force_tangent`` of the viscous acceleration; and ``traction_back`` and
-    ``force_back``, which turn its adjoint into adjoints of T's rows and mu, and of x, v and m. ``control`` is C."""
+    """Make the sums over neighbours for the viscous acceleration, with derivatives."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -182,8 +180,7 @@ def work_types(precision: Precision) -> TypesByName:
 
 
 def stress_work(d: Discretisation) -> Any:
-    """Make the work function of the viscous sum over solids for the adjoint ``acceleration_bar``, with ``constants``
-    ``least`` and ``control`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the Warp function for the adjoints of solids, given the adjoint of the viscous acceleration."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold = contact.fall, contact.hold
 
@@ -207,19 +204,20 @@ def stress_couple_work(d: Discretisation) -> Any:
 
 @dataclass(frozen=True)
 class Law:
-    """A law of viscosity as a function of the shear rate, with the ranks of its parameters: 0 for numbers."""
+    """A law of viscosity as a function of the shear rate and of parameters."""
 
     text: Formula
     ranks: tuple[int, ...]
     topic: str
-    """Name that distinguishes the Warp modules of laws; empty for Newtonian fluids."""
+    """Part of the names of Warp modules; empty for Newtonian fluids."""
 
     @property
     def is_newtonian(self) -> bool:
         return not self.topic
 
     def applied(self, precision: Precision, module: Any) -> Any:
-        """Make the Warp function of shear rate [1/s], viscosity [Pa s] and theta that returns the viscosity [Pa s]."""
+        """Make the Warp function of the viscosity [Pa s]. Its arguments are the shear rate [1/s], the phase's viscosity
+        [Pa s] and the parameters."""
         return applied(self.text, precision, self.ranks, 3, module)
 
 
@@ -246,7 +244,7 @@ def carreau(shear_rate, viscosity, relaxation_time, flow_index, infinite_viscosi
 
 
 def bingham(shear_rate, viscosity, yield_stress, regularisation):
-    """Return a Bingham fluid's viscosity as Papanastasiou (1987) smooths it; for small m g by a series."""
+    """Return the viscosity of a Bingham fluid, smoothed as by Papanastasiou (1987)."""
     x = regularisation * shear_rate
     part = 1.0 - x / 2.0 + x * x / 6.0
     if x > 0.01:
@@ -255,8 +253,7 @@ def bingham(shear_rate, viscosity, yield_stress, regularisation):
 
 
 def herschel_bulkley(shear_rate, viscosity, yield_stress, regularisation, flow_index, least_shear_rate):
-    """Return a Herschel-Bulkley fluid's viscosity: Bingham's law with a power law in place of the constant
-    viscosity."""
+    """Return the viscosity of a Herschel-Bulkley fluid: a power law with a yield stress."""
     x = regularisation * shear_rate
     part = 1.0 - x / 2.0 + x * x / 6.0
     if x > 0.01:
@@ -269,7 +266,7 @@ LAWS: dict[str, Callable[..., Any]] = {law.__name__: law for law in (power_law, 
 
 
 SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
-"""[1/s] at which laws are tried; no particle has a lower shear rate (`cortado.sph.stress_kernels.SLOWEST`)."""
+"""Shear rates for tests of laws [1/s]."""
 
 
 @cache
@@ -289,8 +286,8 @@ def trial_kernel(precision: Precision, law: Law) -> Any:
 def check_law(
     what: str, law: Law, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
 ) -> None:
-    """Raise `InputError` if a law returns an invalid viscosity for a phase of ``viscosities`` or a row of
-    ``thetas``."""
+    """Raise `InputError` if a law returns an invalid viscosity. ``viscosities`` are the viscosities of phases by name,
+    and ``thetas`` the parameters of the law."""
     kernel, rows = trial_kernel(precision, law), np.zeros((len(thetas), theta_of(precision, law.ranks)._length_))
     rows[:, : thetas.shape[1]] = thetas
     given = {"shear_rates": SHEAR_RATES, "viscosities": np.array(list(viscosities.values()))}

@@ -1,38 +1,40 @@
-"""Viscosity as a stress: f = -G^T (2 mu D), the force per volume of the velocity gradient's exact transpose.
+"""Viscosity as a stress: f = -G^T (2 mu D), the force per volume with the exact transpose of the velocity gradient.
 
-With s_ij = -V a_ij of grad W = a x, so that s_ij is not negative, the sums of particle i over its neighbours are
+The kernel gradient is grad W = a x, so that s_ij = -V a_ij is not negative. The sums of particle i over its neighbours
+are
 
     M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j,
 
 and G = A M^-1 is the velocity gradient, exact for linear velocity fields (Bonet and Lok 1999). G is also the
-least-squares fit to the velocities of the neighbours with weights s_ij. The remainders v_ij - G_i x_ij are damped (as
-by Ganzenmueller 2015, against modes that the gradient does not contain):
+least-squares fit to the velocities of the neighbours with weights s_ij. The remainders v_ij - G_i x_ij are damped, as
+by Ganzenmueller (2015), against modes that the gradient does not contain:
 
     m_i a_i = -sum_j s_ij ((T_i + T_j) x_ij + C (mu_i + mu_j) v_ij),   T_i = 2 mu_i D_i M_i^-1 - C mu_i G_i.
 
-The right-hand side is minus half the derivative with respect to v_i of the dissipation sum_i mu_i (2 D_i : D_i + C
-sum_j s_ij |v_ij - G_i x_ij|^2), so that the force never adds energy. The force is 0 in rigid rotation, so that momentum
-and angular momentum are conserved. On a lattice a shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3
-m_2)) k^2 m_4 + ...), with the moments m_2 and m_4 of s_ij along k; C = 4 / (3 m_2) cancels the second term in every
-direction and for every kernel.
+The dissipation is sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij - G_i x_ij|^2). The right-hand side is minus half its
+derivative with respect to v_i, so that the force never adds energy. The force is 0 in rigid rotation, so that momentum
+and angular momentum are conserved.
+
+On a lattice a shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). Here m_2 and
+m_4 are the moments of s_ij along k. C = 4 / (3 m_2) cancels the second term in every direction and for every kernel.
 
 From M, A and R of one particle (`stress_of_particle`) follow
 
     G = A M^-1,   D = (G + G^T) / 2,   mu_m = 1 / (1 / (2 mu_i) + R / (2 tr M)),
     mu = S law(sqrt(2 D : D), mu_m).
 
-mu_m is the harmonic mean of the viscosities between i and its neighbours, by which the shear stress is equal on both
+mu_m is the harmonic mean of the viscosities between i and its neighbours, which makes the shear stress equal on both
 sides of an interface. For a Newtonian fluid the law returns mu_m.
 
-S(M) is 1 if neighbours lie on all sides or on one side, and falls smoothly to 0 if they lie on a line or are missing,
+S(M) is 1 if neighbours lie on all sides or on one side. It falls smoothly to 0 if they lie on a line or are missing,
 where M has no inverse. With the invariants I_2 and I_3 of M,
 
-    H = 3 I_3 / I_2 (in the plane 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
+    H = 3 I_3 / I_2 (in 2-D 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
 H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S > 0, det M is at least 0.008, so that the inverse
 needs no guard.
 
-Users' functions may take velocity gradients S G, with sums over fluid alone. Walls without slip:
+Users' functions may take velocity gradients S G, with sums over fluid alone. Walls without slip are in
 `cortado.sph.stress_forces`.
 """
 
@@ -54,9 +56,9 @@ from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
 from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, work_types
 
 LEAST_VISCOSITY = 1e-12
-"""Number added to viscosities [Pa s], so that the mean of their reciprocals is finite."""
+"""Regularisation of viscosities in harmonic means [Pa s]."""
 SLOWEST = 1e-6
-"""Shear rate [1/s] whose square is added to the squared shear rate, so that a law has a derivative at rest."""
+"""Regularisation of the shear rate at rest [1/s]."""
 EMPTY, FULL = 0.2, 0.5
 
 
@@ -84,7 +86,6 @@ def part_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 
     @wp.func
     def regular(M: matrix) -> matrix:
-        """Return M, or the unit matrix where S is 0 and nothing depends on M."""
         result = M
         if part(M) == real(0.0):
             result = wp.identity(n=3, dtype=real)
@@ -108,8 +109,7 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
 
 
 def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
-    """Make the function of T and mu of a particle in 2 or 3 dimensions. The function computes mu from A, and T from
-    ``A_u``, the sum A of the resisted velocities; ``control`` is C."""
+    """Make the Warp function of the stress and the viscosity of a particle in 2 or 3 dimensions."""
     real, matrix, fluidity = precision.real, precision.matrix, fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
@@ -134,8 +134,8 @@ def stress_of_particle(precision: Precision, dimension: int, law: Law, module: A
 
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
-    """Make the Warp functions of the sums over neighbours of the diagonal of M, its entries yz, xz and xy, the rows of
-    A, and R, with derivatives. Walls have no slip if fluid ``sticks``."""
+    """Make the Warp functions of the sums over neighbours for the velocity gradient and the mean viscosity, with
+    derivatives. Walls are no-slip walls if ``sticks`` is true."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -214,8 +214,7 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
 
 def moments_work(d: Discretisation) -> Any:
-    """Make the work function of the moments' sums over solids, for adjoints ``M_bar``, ``A_bar`` and ``R_bar``; the
-    first of its ``constants`` is ``least`` (`cortado.particles.wall_terms.solid_kernel`)."""
+    """Make the Warp function for the adjoints of solids, given the adjoints of the sums over neighbours."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)
 
@@ -230,12 +229,11 @@ def moments_work(d: Discretisation) -> Any:
 
 @cache
 def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> SimpleNamespace:
-    """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity. ``moments`` computes M, A
-    and R; ``stress`` computes T and mu. ``force`` computes the acceleration, and has two adjoints: of T and mu, and of
-    particles.
+    """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity.
 
-    In kernels ``control`` is C, and ``theta`` the parameters of the law. ``eta`` is the mu of the formulas above,
-    because ``mu`` in a step is the viscosity of the fluid.
+    ``moments`` computes sums over neighbours. ``stress`` computes the stress and the viscosity. ``force`` computes the
+    acceleration. ``control`` is the damping coefficient, ``theta`` are the parameters of the law, and ``eta`` is the
+    viscosity.
     """
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
@@ -280,7 +278,7 @@ def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sti
 
 @cache
 def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
-    """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s] from its sums M and A."""
+    """Make the Warp functions of a particle's velocity gradient [1/s] and shear rate [1/s]."""
     real, matrix = precision.real, precision.matrix
     part, regular = part_functions(precision, dimension)
     inverse, slowest = moment_functions(precision, dimension).inverse, wp.constant(real(SLOWEST**2))

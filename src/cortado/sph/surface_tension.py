@@ -1,19 +1,19 @@
-"""Surface tension: by curvature (`cortado.sph.curvature`), and with PCISPH as a force of pairs, a stress (continuum
-surface stress, Lafaurie et al. 1994):
+"""Surface tension: by curvature (`cortado.sph.curvature`), and for PCISPH as a stress between pairs of particles
+(continuum surface stress, Lafaurie et al. 1994):
 
     n_i = (1 / N) sum_j (1 - s)^2 x_ij,   s = |x|^2 / h^2
     S_i = (|n_i|^2 1 - PART n_i n_i) / sqrt(1 + |n_i|^2)
     m_i s^d a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
 
-The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid; |n|
-is 1 in the outermost layer of a cut lattice, by the choice of N, and about 0 inside. S pulls along the surface, and
+The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. By
+the choice of N, |n| is 1 in the outermost layer of a cut lattice, and about 0 inside. S pulls along the surface, and
 with PART below 1 a little across it, so that particles do not detach. The force of a pair grows with distance up to
 0.65 h, so that particles of the surface do not clump. Gamma is the tension of the cut lattice without Gamma, times
 `RELAXED`.
 
-Forces of a pair are opposite, but not parallel to the pair: momentum is conserved, angular momentum only approximately.
-Neither this force nor that by curvature is the gradient of an energy: fluids with very low viscosity gain energy, see
-`LEAST_VISCOSITY`. Walls do not take part in either force: a surface meets walls at 180 degrees.
+Forces of a pair are opposite, but not parallel to the pair. Momentum is conserved, but angular momentum only
+approximately. Neither of the two forces is the gradient of an energy. Fluids with very low viscosity therefore gain
+energy; see `LEAST_VISCOSITY`. Walls do not take part in surface tension: a surface meets walls at 180 degrees.
 """
 
 from collections.abc import Callable
@@ -41,7 +41,7 @@ PART = 2.0 / 3.0
 
 
 def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
-    """Make the term of a pair of particles in the acceleration by surface tension, over 1 / (Gamma s^d)."""
+    """Make the Warp function for a pair's term in the acceleration by surface tension."""
     real, vector, neighbourhood = discretisation.types
     part, one = wp.constant(real(PART)), wp.constant(real(1.0))
 
@@ -53,7 +53,6 @@ def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
 
     @wp.func
     def stress(n: vector, x: vector) -> vector:
-        """Return S(n) x."""
         return (wp.dot(n, n) * x - (part * wp.dot(n, x)) * n) / wp.sqrt(one + wp.dot(n, n))
 
     @TypesByName(real, {vector: "x normals", neighbourhood: "s"})
@@ -66,7 +65,7 @@ def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
 
 @cache
 def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the acceleration by surface tension; ``scale`` is 1 / (Gamma s^d), with the spacing s."""
+    """Make the kernels of the acceleration by surface tension."""
     modules = discretisation.modules("surface_tension")
     total = fluid_sum(discretisation)(tension_term(discretisation))
     tangent = made_tangent(discretisation, tension_term, modules[1])
@@ -77,7 +76,7 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def normal_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the surface normals n; ``inverse`` is 1 / N."""
+    """Make the kernels of the surface normals."""
     real, vector, neighbourhood = discretisation.types
     one = wp.constant(real(1.0))
 
@@ -90,7 +89,6 @@ def normal_kernels(discretisation: Discretisation) -> Kernels:
     @tangent_of(arrows)
     @fluid_sum(discretisation)
     def change(x_ij: vector, v_ij: vector, s: neighbourhood) -> vector:
-        """Return the derivative of a pair's term along v, which is symmetric and serves both tangent and adjoint."""
         h2 = s.support * s.support
         d = wp.max(one - wp.dot(x_ij, x_ij) / h2, real(0.0))
         return (d * d) * v_ij - (real(4.0) * d * wp.dot(x_ij, v_ij) / h2) * x_ij
@@ -137,11 +135,12 @@ class CurvatureTension:
 
 
 RELAXED = {2: 1.1, 3: 1.25}
-"""By dimension: ratio of the surface's tension after flow to that of a cut lattice; docs/records/surface_tension.md."""
+"""Ratio of the surface tension after flow to the surface tension of a cut lattice, for each dimension."""
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
-"""In spacings: with a smaller support drops fall apart into pairs, and curvatures are too noisy."""
+"""Smallest support radius for each kind of surface tension [spacings]."""
 LEAST_VISCOSITY = 0.05
-"""Least viscosity of stable drops, over sqrt(rho sigma R) [-], with the radius R of a ball of all the fluid."""
+"""Smallest viscosity of stable drops, relative to sqrt(rho sigma R) with density rho, surface tension sigma and radius
+R [-]."""
 
 
 class SurfaceTension:
@@ -149,7 +148,6 @@ class SurfaceTension:
     batches = True
 
     def __init__(self, discretisation: Discretisation, inverse: float, scale: float, layout: Layout):
-        """Prepare the force with ``inverse`` and ``scale`` from `tension_constants`."""
         self._normal, self._kernels = normal_kernels(discretisation), surface_tension_kernels(discretisation)
         self._inverse, self._scale = inverse, scale
         vector = layout.precision.vector
@@ -173,7 +171,8 @@ class SurfaceTension:
 
 
 def tension_constants(spacing: float, support: float, dimension: int) -> tuple[float, float]:
-    """Return 1 / N [1 / m] and 1 / (Gamma s^d) [1 / m^(d + 2)] of a lattice of spacing s that is cut along an axis."""
+    """Return the factor of surface normals [1 / m] and the factor of the force [1 / m^(d + 2)], computed from a cut
+    lattice."""
     offsets = lattice_offsets(spacing, support, dimension)
     s = (offsets**2).sum(axis=1) / support**2
     outwards = np.rint(offsets[:, 0] / spacing).astype(int)
@@ -193,7 +192,7 @@ def tension_constants(spacing: float, support: float, dimension: int) -> tuple[f
 
 
 def force(setting: Setting) -> Force:
-    """Make the surface tension of a scene; warn if it is likely to tear the fluid apart."""
+    """Make the surface tension of a scene. Warn if the force is likely to tear the fluid apart."""
     scene, lattice = setting.scene, setting.lattice
     form = "pairs" if scene.solver.kind == "pcisph" else "curvature"
     support, least = scene.discretisation.support, LEAST_SUPPORT[form]

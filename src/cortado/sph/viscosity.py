@@ -30,8 +30,8 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 @cache
 def pairwise(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of phi(x, v): ``force``, ``tangent``, and ``adjoint_x`` and ``adjoint_v``, the transposed
-    derivatives with respect to x and v applied to a vector."""
+    """Make the Warp functions of a pair's viscous term: ``force``, ``tangent``, and the adjoints ``adjoint_x`` and
+    ``adjoint_v`` with respect to position and velocity."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change, per_size = pair.slope, pair.slope_change, pair.per_size
@@ -64,8 +64,8 @@ def pairwise(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
-    """Make the kernels of the viscous acceleration; without ``sticks`` all walls slip freely. The derivatives are those
-    of the sum over the fluid; `viscosity_term` has those of walls."""
+    """Make the kernels of the viscous acceleration. Walls are no-slip walls if ``sticks`` is true. The derivatives
+    leave walls out; see `viscosity_term`."""
     real, vector, neighbourhood = discretisation.types
     phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
@@ -79,12 +79,10 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @wp.func
     def pair_viscosity(a: real, b: real) -> real:
-        """Return mu_ij, the harmonic mean of two viscosities; 0 where both are 0."""
         return real(2.0) * a * part(a, b)
 
     @wp.func
     def pair_viscosity_derivative(a: real, b: real) -> real:
-        """Return d mu_ij / d mu_i; where both are 0, the derivative for both increasing together."""
         return real(2.0) * part(a, b) * part(a, b)
 
     @wp.func_grad(pair_viscosity)
@@ -186,7 +184,7 @@ class Viscosity:
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:
-    """Make the viscous force in the form that a scene names; None for a scene without viscosity."""
+    """Make the viscous force of a scene, or return None without viscosity."""
     form = setting.scene.forces.viscosity
     if form == "stress":
         return stress_of(setting.scene)(setting)

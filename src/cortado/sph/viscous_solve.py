@@ -1,9 +1,7 @@
-"""The solve of the implicit viscous stress (`cortado.sph.viscous_stress`) by conjugate gradients (Hestenes and Stiefel
-1952).
+"""The solve of the implicit viscous stress by conjugate gradients (Hestenes and Stiefel 1952).
 
-They solve B y = r for vectors of particles and for a few numbers of each free body. B is symmetric and positive
-definite in the product sum_i m_i a_i . b_i with the masses m, which defines all norms here. A scene of a batch iterates
-until |r| has fallen to round-off of the first |r|.
+The unknowns are vectors of particles and a few numbers of each free body. The matrix is symmetric and positive definite
+in the scalar product weighted with masses. Each scene of a batch iterates until its residual has fallen to round-off.
 """
 
 from functools import cache
@@ -51,8 +49,7 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, s
 
 @cache
 def solve_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of conjugate gradients; ``going`` (members,) is 1 for scenes that iterate. ``begin`` and
-    ``start`` begin a solve, ``descend`` takes a step along p, ``turn`` computes the next p, ``decide`` ends scenes."""
+    """Make the kernels of conjugate gradients. ``going`` (members,) is 1 for scenes that still iterate."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"conjugate_gradients_{type_name(vector)}")
     typed = TypesByName(real, {vector: "r p y product", wp.int32: "count going active"})
@@ -117,7 +114,7 @@ MOST = 1_000
 
 
 class Solve:
-    """Solves B y = r, in scenes that are still going to at most `MOST` iterations."""
+    """Solves the linear system of the implicit viscous stress."""
 
     name, most = "viscous_iterations", MOST
 
@@ -134,8 +131,8 @@ class Solve:
         self._sums = layout.sum_of(real), layout.sum_of(real)
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
-        """Write to ``y`` the solution of B y = r, (n,) vectors both, and overwrite ``r``; ``known`` has arguments of
-        B's kernels."""
+        """Write the solution to ``y`` (n,), given the right-hand side ``r`` (n,). ``r`` is overwritten. ``known`` are
+        kernel arguments."""
         kernels, (sum_shares, sum_curvatures), rows = self._kernels, self._sums, self._free.rows
         n, members, sizes = self._layout.all_particles, self._layout.members, {"particles": self._layout.particles}
         own = {**self._own, "w": step.fields["m"], "r": r, "y": y}
@@ -168,13 +165,14 @@ class Solve:
         wp.capture_while(self._active, iterate)
 
     def _apply(self, step: StepContext, known: Any, p: wp.array) -> None:
-        """Write B p to ``product``, and each particle's term of p^T B p to ``share``."""
+        """Write the product of the matrix and ``p``, and each particle's term of its scalar product with ``p``."""
         step.launch(self._pull, *known, v=p)
         self._free.lean(step, known, p)
         step.launch(self._multiply, *known, self._own, v=p)
         self._free.multiply(step, known, p, self._own)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add to ``r`` the product of B with velocities of bodies alone; ``still`` are zero velocities of particles."""
+        """Add to ``r`` the product of the matrix and the velocities of rigid bodies. ``still`` are zero velocities of
+        particles."""
         self._apply(step, known, still)
         add(self._own["product"], r)

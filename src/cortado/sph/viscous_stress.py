@@ -40,17 +40,17 @@ from cortado.sph.stress_kernels import moments_work, stress_kernels
 from cortado.sph.viscous_solve import Solve, operator_kernels
 
 CLOSEST = 0.25
-"""In spacings: distance below which the pull of walls without slip is constant (`cortado.sph.stress_forces`)."""
+"""Distance from a no-slip wall below which its force is constant [spacings]."""
 
 
 class ViscousStress:
-    """The explicit viscous force as a stress; its arrays are those of the last step."""
+    """The explicit viscous force as a stress. Its arrays are from the last step."""
 
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
     def __init__(self, setting: Setting, law: Law | None = None, parameters: Sequence[Parameter] = ()):
-        """Prepare the force with a ``law`` of viscosity and its parameters, by default Newtonian."""
+        """Prepare the force with a ``law`` of viscosity and its parameters. The default is a Newtonian fluid."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
         self._made_for = (discretisation, scene.dimension, self._law, scene.sticks)
@@ -72,7 +72,7 @@ class ViscousStress:
         return self._layout.arrays(requires_grad=taped, **kinds)
 
     def compile(self, what: str) -> None:
-        """Compile the kernels with the law of viscosity; raise `InputError` if Warp cannot compile them."""
+        """Compile the kernels with the law of viscosity. Raise `InputError` if Warp cannot compile them."""
         compiled(what, self._kernels.stress.forward.module, self._layout.device, "number")
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -81,7 +81,6 @@ class ViscousStress:
         step.launch(self._kernels.force.forward, self.constants, self._of, **accelerations)
 
     def _measure(self, step: StepContext) -> None:
-        """Write M, A, R, T and mu of the velocities at the start."""
         self.free.begin(step)
         step.launch(self._kernels.moments.forward, self.constants, self._of)
         self.free.gather(step, self._of)
@@ -93,8 +92,7 @@ class ViscousStress:
         step.launch(self._kernels.force.tangent, *known, acceleration_in_dot=before, acceleration_dot=after)
 
     def _stress_along(self, step: StepContext, dot: Tangents, resisted: Named | None = None) -> dict[str, wp.array]:
-        """Write the tangents of T and mu; ``resisted`` has other resisted velocities ``v``, their tangent and
-        ``A_u``."""
+        """Write the tangents of stress and viscosity. ``resisted`` are the arrays of `resisted` with tangents."""
         change, known = {f"{name}_dot": a for name, a in self._change.items()}, (*dot.named, self.constants, self._of)
         free = self.free.dots
         free.begin(step, dot)
@@ -112,8 +110,8 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """Add to the adjoints of the acceleration's inputs, given the adjoint of the acceleration. ``now`` has the
-        arrays of `resisted`; the adjoint of the resisted velocities is added to ``v_bar``."""
+        """Add to the adjoints of the force's inputs, given the adjoint of the acceleration. ``now`` are the arrays of
+        `resisted`."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
@@ -124,9 +122,8 @@ class ViscousStress:
         self._give(step, bar, 1, *known)
 
     def back_to_sums(self, step: StepContext, bar: Adjoints, bars: dict[str, wp.array], now: Named) -> None:
-        """Turn the adjoints of T and mu into adjoints of the sums, and these into adjoints of particles and solids.
-        ``now`` has the arrays of `resisted`, ``bars`` those of the adjoints of M, R, A and A_u and of the resisted
-        velocities."""
+        """Convert the adjoints of stress and viscosity to adjoints of particles and solids. ``now`` are the arrays of
+        `resisted`, and ``bars`` are adjoints of sums over neighbours."""
         known = self._own.back(step), bars, now, *bar.named, self.constants, self._of
         step.launch(self._kernels.stress.adjoint, *known)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
@@ -148,7 +145,6 @@ class ViscousStress:
         return {f"{name}_bar": array for name, array in self.arrays("M", "R").items()}
 
     def _give(self, step: StepContext, bar: Adjoints, which: int, *known: Named) -> None:
-        """Add to adjoints of moving solids, given adjoints of the sums (``which`` 0) or accelerations (1)."""
         if self._made_for[-1]:
             work = (moments_work, stress_work)[which]
             kernel = partial(solid_kernel, self._made_for[0], "viscous_stress", work, rubs=True)
@@ -156,7 +152,7 @@ class ViscousStress:
             bar.solids.add(step.launch, kernel, *known, self._of, constants=constants)
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
-        """Return T, eta, the velocities ``v`` that friction resists in the step, and their sums A as ``A_u``."""
+        """Return the stress, the viscosity, the velocities ``v`` on which the stress acts, and their sums ``A_u``."""
         return {**{name: self._of[name] for name in ("T", "eta")}, "A_u": self._of["A"], "v": step.fields["v"]}
 
     def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
@@ -167,10 +163,10 @@ class ViscousStress:
 
 
 class StressWalls:
-    """The sums by which walls act on particles through viscous stress: a `cortado.sph.density.WallAction`."""
+    """The action of walls on particles through the viscous stress."""
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
-        """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in the friction with free
+        """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in the friction with rigid
         bodies."""
         self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
@@ -211,7 +207,7 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
     @particle_kernel(module, "u")
     def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
-        """Return u = v + dt a; given the tangents of v and dt, the tangent of u for constant a."""
+        """Return the velocity after a time step with constant acceleration."""
         return v_i + time_step * acceleration_i
 
     @particle_kernel(module, "r")
@@ -230,7 +226,7 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
 
 class ImplicitViscousStress(ViscousStress):
-    """The viscous stress of the velocities at the end of a step, which comes after all other forces."""
+    """The implicit viscous force, from the velocities at the end of a step. It is the last force of a step."""
 
     is_last = True
 
@@ -269,7 +265,7 @@ class ImplicitViscousStress(ViscousStress):
         self._after = after
 
     def _find_end(self, step: StepContext, acceleration: wp.array) -> None:
-        """Write the velocities u = v + dt a at the end of the step, and their A and T."""
+        """Write the velocities at the end of the step, and their velocity sums and stresses."""
         step.launch(self._implicit.predict, acceleration=acceleration, u=self._u)
         self.free.hang(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)
@@ -311,7 +307,7 @@ class ImplicitViscousStress(ViscousStress):
         self.free.bars.finish(step, bar, v_bar)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
-        """Apply the adjoint of the force, and return that of the acceleration by all other forces."""
+        """Apply the adjoint of the force, and return the adjoint of the sum of all earlier forces' accelerations."""
         step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
         if self.free.rows:
             self.free.bars.take(step, bar)

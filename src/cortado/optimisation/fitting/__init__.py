@@ -1,1 +1,1 @@
-"""Fits of measured experiments: parameters with error bars, from videos, sensors and tracks."""
+"""Fits of parameters to measured experiments with error bars, from videos, sensors and tracks."""

@@ -1,22 +1,26 @@
-"""Standard errors of a least-squares estimate with residuals correlated within a frame and from frame to frame.
+"""Standard errors of a least-squares estimate with residuals that are correlated within a frame and from frame to
+frame.
 
-Near the estimate the residuals are r = e - J t, with the noise e (frames, m), the Jacobian J (frames, m, parameters)
-and the error t of the estimate. The m numbers of a frame are not independent, because neighbouring pixels, and all
-light of a frame, vary together.
+Near the estimate the residuals are r = e - J t. Here e (frames, m) is the noise, J (frames, m, parameters) the
+Jacobian, and t the error of the estimate. The m numbers of a frame are not independent, because neighbouring pixels,
+and all light of a frame, vary together.
 
-1. The correlation of noise at two times is exp(-dt / T). The correlation time T reproduces the correlation of the fit's
-   residuals between neighbouring frames (`correlation_time`). A second fit uses frames that are `whitened` in time.
-2. Within a frame the noise has any covariance C, the same for every frame. The covariance of the score is the sum
+1. The correlation of noise at two times is exp(-dt / T), where dt is the difference of the times. The correlation time
+   T reproduces the correlation of the fit's residuals between neighbouring frames (`correlation_time`). A second fit
+   uses frames that are `whitened` in time.
+2. Within a frame the noise has an arbitrary covariance C, which is the same for every frame. The covariance of the
+   score J^T e is the sum
 
        B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T
 
-   over the whitened residuals of F frames. B has F times the samples of the cluster-robust sum of (J_f^T r_f)(J_f^T
-   r_f)^T (Liang and Zeger 1986). The covariance of the estimate is N^-1 B N^-1 with N = sum_f J_f^T J_f.
-3. B is increased by the mean part that the fit absorbed, and the degrees of freedom of Student's distribution follow
-   Satterthwaite (1946).
-4. T is an estimate too. With the correlation c from frame to frame, the variance of an estimate is proportional to
-   (1 + c) / (1 - c), and the variance of c is (1 - c^2) / n for n independent numbers. To second order, B is therefore
-   larger by the factor 1 + 2 / (n (1 - c)) on average.
+   over F frames f and h with whitened residuals r_h. B has F times as many samples as the cluster-robust sum of
+   (J_f^T r_f)(J_f^T r_f)^T (Liang and Zeger 1986). The covariance of the estimate is N^-1 B N^-1 with the Hessian
+   N = sum_f J_f^T J_f.
+3. B is corrected for the mean part of the noise that the fit absorbed. The degrees of freedom of Student's distribution
+   follow Satterthwaite (1946).
+4. The correlation time T is uncertain too. The variance of an estimate is proportional to (1 + c) / (1 - c), where c is
+   the correlation from frame to frame. The variance of c is (1 - c^2) / n for n independent numbers. To second order,
+   B is therefore larger by the factor 1 + 2 / (n (1 - c)) on average.
 """
 
 from dataclasses import dataclass
@@ -28,21 +32,21 @@ from cortado.errors import ComputationError
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Part, Weighting, Weights, weighted
 
 LONGEST = 3.0
-"""Greatest correlation time, relative to the length of the record."""
+"""Greatest correlation time, relative to the duration of the measurement."""
 SHORTEST = 0.05
-"""Shorter correlation times, relative to the time between two frames, count as 0."""
+"""Least correlation time of correlated noise, relative to the time between two frames."""
 
 
 @dataclass(frozen=True)
 class Products:
-    """Products of Jacobians and residuals, summed over the numbers of a frame, for all pairs of frames."""
+    """Products of Jacobians and residuals for all pairs of frames."""
 
     S: np.ndarray
-    """Products J_f^T C J_g (F, F, p, p)."""
+    """Products of two frames' Jacobians and the noise covariance (F, F, p, p)."""
     K: np.ndarray
-    """Products J_f^T J_g (F, F, p, p)."""
+    """Products of two frames' Jacobians (F, F, p, p)."""
     gram: np.ndarray
-    """Products r_f . r_g (F, F)."""
+    """Products of two frames' residuals (F, F)."""
 
     @classmethod
     def of(cls, J: np.ndarray, r: np.ndarray) -> "Products":
@@ -56,26 +60,26 @@ class Products:
 
 @dataclass(frozen=True)
 class ScoreCovariance:
-    """The covariance of the score J^T e of an observation."""
+    """The covariance of an observation's score, which is the transposed Jacobian times the noise."""
 
     B: np.ndarray
-    """Covariance (p, p) of the score."""
+    """Covariance of the score (p, p)."""
     products: Products
     lost: float
-    """Mean part of B that the fit absorbed."""
+    """Mean fraction of the covariance that the fit removes from the residuals."""
     samples: float
     frames: float
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Return Satterthwaite's degrees of freedom (1946) for the parameter combination ``direction`` (p,), given
-        N^-1; at most the number of independent numbers."""
+        """Return Satterthwaite's degrees of freedom (1946) for a combination of parameters ``direction`` (p,).
+        ``inverse`` is the inverse Hessian."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
 
 
 def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: np.ndarray) -> float:
-    """Estimate the correlation time T [s] of the noise, 0 without correlation; ``inverse``: N^-1 of the fit."""
+    """Estimate the correlation time of the noise [s], or 0 without correlation. ``inverse`` is the inverse Hessian."""
     from scipy.optimize import brentq
 
     products, gap = Products.of(J, r), float(np.median(np.diff(times)))
@@ -86,7 +90,6 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
     found = float(np.diag(gram, 1).sum()) / total
 
     def excess(logarithm: float) -> float:
-        """Return the difference between expected and found correlation of neighbouring frames, for log T."""
         R = np.exp(-np.abs(times[:, None] - times) / np.exp(logarithm))
         V = inverse @ np.einsum("kl,klpq->pq", R, products.S, optimize=True) @ inverse
         expected = R * total / len(r) - taken @ R - (taken @ R).T + np.einsum("pq,ghqp->hg", V, products.K)
@@ -101,14 +104,15 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """Return the number F (1 - c) / (1 + c) of independent frames, with correlation c from frame to frame."""
+    """Return the number of independent frames, F (1 - c) / (1 + c), for F frames and the correlation c from frame to
+    frame."""
     c = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
     return float(len(times) * (1.0 - c) / (1.0 + c))
 
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
-    """Estimate the covariance of the score J^T r from weighted, whitened residuals r (F, m) and Jacobians J (F, m, p).
-    ``inverse``: N^-1; ``frames``: see `independent_frames`."""
+    """Estimate the covariance of the score from weighted, whitened residuals r (F, m) and Jacobians J (F, m, p).
+    ``inverse`` is the inverse Hessian, and ``frames`` is the result of `independent_frames`."""
     F, products = len(r), Products.of(J, r)
     B = np.einsum("ffpq->pq", products.S)
     once = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse, products.S, optimize=True) / F
@@ -128,8 +132,8 @@ def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: 
 
 
 def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
-    """Return unbiased estimates of (tr C)^2 and tr C^2, from a matrix of F samples whose trace estimates tr C, and
-    whose squared norm estimates tr C^2."""
+    """Return unbiased estimates of (tr C)^2 and tr C^2 for a covariance matrix C, from the products ``gram`` of F
+    samples."""
     trace, square = float(np.trace(gram)), float((gram**2).sum())
     if not trace > 0.0:
         return 1.0, 1.0
@@ -143,7 +147,7 @@ class FittedPart:
     part: Part
     weighting: Weighting
     residuals: np.ndarray
-    """Predicted minus measured numbers (frames, m), in the unit of the observation; 0 for ignored numbers."""
+    """Predicted minus measured numbers (frames, m), in the unit of the observation. They are 0 for ignored numbers."""
     spread: float
     samples: float
     frames: float
@@ -168,10 +172,10 @@ Fitted = LeastSquares | Widened
 
 @dataclass(frozen=True)
 class Certainty:
-    """Hessian, covariance and degrees of freedom of an estimate, from the scatter of its residuals."""
+    """Hessian, covariance and degrees of freedom of an estimate, from its residuals."""
 
     hessian: np.ndarray
-    """N = J^T J (free, free) of weighted Jacobians."""
+    """Hessian (free, free), computed from the weighted Jacobians."""
     covariance: np.ndarray
     """Covariance (free, free) of the coordinates."""
     degrees_of_freedom: np.ndarray
@@ -181,7 +185,8 @@ class Certainty:
 
     @classmethod
     def of(cls, problem: Fitted, at: Linearised, weights: Weights) -> "Certainty":
-        """Compute the certainty at a point; raise `ComputationError` if a combination of parameters is undetermined."""
+        """Compute the certainty at a point. Raises `ComputationError` if a combination of parameters is
+        undetermined."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()
@@ -203,7 +208,7 @@ class Certainty:
 
 
 def noise_of(problem: Fitted, at: Linearised, weights: Weights) -> list[Weighting]:
-    """Return weights from the residuals of a first fit, smaller for correlated numbers."""
+    """Return weights from the residuals of a first fit. Correlated residuals have smaller weights."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
     for part, r, J, weight in zip(problem.parts, at.residuals, at.jacobians, weights, strict=True):
@@ -219,19 +224,20 @@ def noise_of(problem: Fitted, at: Linearised, weights: Weights) -> list[Weightin
 
 
 def counted_covariance(problem: Fitted, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return the covariance (free, free) of the estimate if all measured numbers were independent."""
+    """Return the covariance of the estimate (free, free), assuming that all measured numbers are independent."""
     alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
     return inverse(problem, hessian(problem, at, alone))
 
 
 def hessian(problem: Fitted, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return N = J^T J (free, free) of the weighted Jacobians."""
+    """Return the Hessian (free, free), computed from the weighted Jacobians."""
     flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))
 
 
 def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
-    """Return N^-1 (free, free); raise `ComputationError` if a combination of parameters is undetermined."""
+    """Return the inverse of the Hessian N (free, free). Raises `ComputationError` if a combination of parameters is
+    undetermined."""
     labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
@@ -249,6 +255,6 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
 
 
 def spread(r: np.ndarray) -> float:
-    """Return the root mean square of the residuals, without the residuals 0 of ignored numbers."""
+    """Return the root mean square of the non-zero residuals."""
     count = np.count_nonzero(r)
     return float(np.sqrt((r**2).sum() / max(count, 1)))

@@ -1,7 +1,7 @@
-"""Sentences of doubt about a fitted model: residuals larger than the noise, and their possible causes.
+"""Sentences of doubt about a fitted model if its residuals are larger than the noise, with possible causes.
 
-Causes are a trend, a late clock, another density, or slipping walls. The size of a cause, a direction in which
-predictions change, is fitted together with the parameters, with an error bar.
+Causes are a trend, a late clock, a wrong density, or slipping walls. Each cause changes the predictions along a
+direction. Its size is fitted together with the parameters, with an error bar.
 """
 
 import warnings
@@ -26,13 +26,15 @@ from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE_IN_MOTION = 2.0
-"""Greatest ratio of the residuals of moving numbers to those of still numbers without a warning."""
+"""Ratio of the residuals of changing numbers to the residuals of constant numbers that causes a warning."""
 EXACT = 1e-4
-"""Residuals below this part of the largest measured number come from simulated measurements, and cause no doubt."""
+"""Greatest size of negligible residuals, relative to the largest measured number. Simulated measurements have
+negligible residuals."""
 
 
 def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> tuple[str, ...]:
-    """Return sentences of doubt about a fit; empty if residuals look like noise and determine the parameters."""
+    """Return sentences of doubt about a fit, or nothing if the residuals look like noise and determine the
+    parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
@@ -77,8 +79,8 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return the root mean square residual of numbers with constant predictions, such as a video's background, and of
-    all other numbers. With fewer than 20 constant predictions return infinity and 0."""
+    """Return the root mean square residuals of numbers with constant predictions, such as the background of a video,
+    and of the remaining numbers. With fewer than 20 constant predictions, return infinity and 0."""
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
     still = counted & (change <= 0.01 * np.max(change[counted], initial=0.0))
@@ -89,7 +91,7 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
 
 
 def _halves(problem: LeastSquares, at: Linearised, weights: Weights, scores: Sequence[ScoreCovariance]) -> list[str]:
-    """Return sentences about parameters of which the two halves of the frames tell different Gauss-Newton steps."""
+    """Return sentences on parameters with different estimates from the first and the second half of the frames."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -115,7 +117,8 @@ def _halves(problem: LeastSquares, at: Linearised, weights: Weights, scores: Seq
 
 @dataclass(frozen=True)
 class Explained:
-    """The sizes (causes,) of causes of residuals, and the ``share`` of the sum of squares that the causes explain."""
+    """The sizes of possible causes of residuals (causes,), and the explained fraction ``share`` of the sum of
+    squares."""
 
     sizes: np.ndarray
     share: float
@@ -124,10 +127,12 @@ class Explained:
 def explained(
     problem: LeastSquares, at: Linearised, weights: Weights, columns: Sequence[np.ndarray], is_doubted: bool = False
 ) -> Explained | None:
-    """Estimate the sizes of possible causes of residuals by a Gauss-Newton step. ``columns``: derivatives (frames, m,
-    causes) of each part's predictions. Return None if the sizes are within the noise, or undetermined.
+    """Estimate the sizes of possible causes of residuals by a Gauss-Newton step. Return None if the sizes are within
+    the noise or undetermined.
 
-    ``is_doubted``: the residuals are no noise, so that causes must explain half of the sum of squares instead."""
+    ``columns`` are derivatives (frames, m, causes) of the predictions of each observation. If ``is_doubted`` is true,
+    the residuals are not noise, and the causes must explain half of the sum of squares.
+    """
     from scipy.stats import f as fisher
 
     count = columns[0].shape[-1]
@@ -157,7 +162,7 @@ def explained(
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences about the fluid's density and the container's slip, from further runs."""
+    """Return sentences on the density of the fluid and the slip of the container. They need additional runs."""
     values, found = problem.coordinates.values(at.u), list[str]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
@@ -191,7 +196,7 @@ def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
 
 
 def _trends(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences about linear and quadratic trends in parts of at most four numbers per frame."""
+    """Return sentences on linear and quadratic trends, for observations with at most four numbers per frame."""
     found = []
     for k, part in enumerate(problem.parts):
         times, measured = part.observation.times, part.observation.measured
@@ -231,7 +236,7 @@ def _clocks(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str
 def _by_change(
     problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
 ) -> list[np.ndarray]:
-    """Return the change of each part's predictions by a function of an experiment, 0 where its run fails."""
+    """Return the changes of all predictions when ``change`` modifies an experiment. They are 0 if the run fails."""
     columns = _nothing(problem, 1)
     for k, experiment in enumerate(problem.experiments):
         try:
@@ -246,13 +251,11 @@ def _by_change(
 
 
 def _by_density(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    """Return the numbers of runs and tangents, and the derivatives of predictions by the logarithm of all densities."""
     _, slopes = experiment.linearised(values, [{"rest_density": experiment.simulation.parameters()["rest_density"]}])
     return 1, 1, {name: slope[..., 0] for name, slope in slopes.items()}
 
 
 def _by_slip(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    """Return the numbers of runs and tangents, and the change of predictions with the container's other slip."""
     slip = getattr(experiment.simulation.scene.container, "slip", None)
     if slip is None:
         return 0, 0, {}

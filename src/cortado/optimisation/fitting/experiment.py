@@ -1,4 +1,4 @@
-"""The class `Experiment`: a simulation together with measurements."""
+"""The class `Experiment`, a simulation together with measurements."""
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,12 +21,12 @@ from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
 
 ROOM = 16
-"""Number of steps by which a run is extended when a calibrated clock is late."""
+"""Number of additional steps of a run for a late clock."""
 
 
 @fixed
 class Experiment:
-    """A simulation of an experiment and its measurements, by names that you choose.
+    """A simulation of an experiment, with measurements by user-defined names.
 
     Example::
 
@@ -41,8 +41,8 @@ class Experiment:
         steps: int | None = None,
         state: RestartState | None = None,
     ):
-        """Store ``observations`` such as ``{"camera": measured.Video(...)}``. ``steps``: by default up to the last
-        frame. ``state``: the first state, as in `Problem`."""
+        """Store a ``simulation`` and its ``observations``, such as ``{"camera": measured.Video(...)}``. ``steps`` is
+        the number of steps, by default up to the last frame. ``state`` is the initial state, as in `Problem`."""
         require_table("observations", observations, "{'camera': measured.Video(...)}")
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is {shown(simulation)}, but must be a cortado.Simulation.")
@@ -73,18 +73,19 @@ class Experiment:
 
     @property
     def start(self) -> Arrays:
-        """Return first values of the observations' parameters, such as "camera.rotation"."""
+        """Return the initial values of the observations' parameters, such as "camera.rotation"."""
         return {f"{name}.{key}": v for name, one in self.observations.items() for key, v in one.start.items()}
 
     @property
     def unseen(self) -> Arrays:
-        """Return masks by the names of `start`, true for numbers on which no measurement depends."""
+        """Return a mask for each parameter of `start`. It is true for components that do not affect any measurement."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """Return the bounds [s] of each calibrated clock: half the record's length to both sides."""
+        """Return the bounds of each calibrated clock [s]. The bounds are half of the measurement's duration before and
+        after 0."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -93,24 +94,26 @@ class Experiment:
         return found
 
     def simulated_by(self, simulation: Simulation) -> "Experiment":
-        """Return this experiment with another simulation of the same number of particles."""
+        """Return this experiment with a new simulation, which must have the same number of particles."""
         return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
-        """Return this experiment, sharing its arrays, with other measured numbers (frames, m) by name."""
+        """Return this experiment with new measured numbers (frames, m) by observation name. The copy shares all
+        remaining arrays."""
         found = object.__new__(Experiment)
         again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
         return found
 
     def predicted(self, parameters: Values) -> Arrays:
-        """Return the simulation's predictions for each observation, (frames, m) by name."""
+        """Return the predicted numbers of each observation (frames, m), by name."""
         frames, values = self._frames(parameters), self._shared(parameters)
         wanted = self._wanted(frames)
         return self._read(self._problem(values, wanted).states(values, wanted), frames, parameters)
 
     def linearised(self, parameters: Values, directions: Sequence[Values]) -> tuple[Arrays, Arrays]:
-        """Return predictions (frames, m) and derivatives along directions (frames, m, directions), by forward mode."""
+        """Return predictions (frames, m) and their derivatives along directions (frames, m, directions), by forward
+        mode."""
         values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
         frames = self._frames(parameters)
         wanted = self._wanted(frames)
@@ -164,7 +167,7 @@ class Experiment:
         return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
 
     def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
-        """Return a problem of at least the ``wanted`` steps, with the viscosity scheme for these values."""
+        """Return a problem that covers the ``wanted`` steps. Its viscosity scheme suits the given values."""
         scene, steps = self.simulation.scene, self.problem.steps
         if wanted[-1] > steps:
             steps += -(-(wanted[-1] - steps) // ROOM) * ROOM

@@ -1,4 +1,4 @@
-"""Pictures and HTML page of a fit: numbers, residuals, profiles, and videos compared with the simulation."""
+"""Figures and the HTML page of a fit: fitted numbers, residuals, profiles, and videos beside the simulation."""
 
 from collections.abc import Sequence
 from html import escape
@@ -12,7 +12,7 @@ from cortado.pictures.pages import Figures, picture, table
 from cortado.pictures.plots import DASHED, FAINT, INK, PALETTE, drawing, images
 
 AGREE = 0.2
-"""Brightness of pixels at which two pictures agree."""
+"""Brightness of pixels where two pictures agree."""
 
 
 def residual_figure(fitted: Fit, path: Path) -> Figures:

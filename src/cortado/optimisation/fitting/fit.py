@@ -1,4 +1,5 @@
-"""`cortado.fit`: fit parameters to measured experiments, with error bars and doubts about the model."""
+"""The function `cortado.fit`, which fits parameters to measured experiments. It also computes error bars and doubts
+about the model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,26 +34,25 @@ OF_VIEWS = {
     "start": "s",
 }
 FAR, SAME = 3.0, 1e-3
-"""Two searches ended in different local minima if their ends are further apart than both thresholds: `FAR` standard
-errors, and the relative difference `SAME`."""
+"""Least distance [standard errors] and least relative difference between two distinct local minima."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The least sum of squares as a function of a number, with all other numbers fitted."""
+    """The least sum of squares as a function of one fitted number. All remaining numbers are fitted at each value."""
 
     label: str
     values: np.ndarray
-    """Values (points,) of the number, in its unit."""
+    """Values of the fitted number (points,), in its unit."""
     deviance: np.ndarray
-    """Sum of squares (points,) minus the least one, in squared standard errors."""
+    """Sum of squares minus its minimum (points,), in squared standard errors."""
     expected: np.ndarray
-    """The deviance (points,) of the linear model from which the intervals are computed."""
+    """Deviance of the linear model (points,), on which the confidence intervals are based."""
 
 
 @dataclass(frozen=True)
 class FittedNumber:
-    """A fitted number with standard ``error`` and interval from ``lower`` to ``upper``."""
+    """A fitted number with its standard error and its confidence interval from ``lower`` to ``upper``."""
 
     label: str
     start: float
@@ -69,18 +69,18 @@ class FittedNumber:
 
 @dataclass(frozen=True)
 class Tried:
-    """A start of a fit, and the end of the search from this start, as coordinates (free,)."""
+    """The start and the end of a search, as coordinates (free,)."""
 
     start: np.ndarray
     end: np.ndarray
     misfit: float
-    """Mean logarithm of the size of the residuals at the end."""
+    """Mean logarithm of the residuals' size at the end of the search."""
 
 
 @public
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that were fitted to experiments, with their error bars.
+    """Fitted parameters of experiments, with error bars.
 
     Example::
 
@@ -90,55 +90,58 @@ class Fit:
 
     coordinates: Coordinates = field(repr=False)
     u: np.ndarray = field(repr=False)
-    """Fitted coordinates (free,): numbers, or logarithms of positive numbers."""
+    """Fitted coordinates (free,). A coordinate is a fitted number, or its logarithm for a positive parameter."""
     coordinate_covariance: np.ndarray = field(repr=False)
-    """Covariance (free, free) of the coordinates."""
+    """Covariance of the coordinates (free, free)."""
     naive_covariance: np.ndarray = field(repr=False)
-    """Covariance (free, free) if all measured numbers were independent, for comparison; far too small."""
+    """Covariance (free, free) under the assumption that all measured numbers are independent. It is far too small, and
+    serves for comparison."""
     degrees_of_freedom: np.ndarray = field(repr=False)
-    """Degrees of freedom (free,) of Student's t-distribution."""
+    """Degrees of freedom of Student's t-distribution (free,)."""
     parts: tuple[FittedPart, ...] = field(repr=False)
-    """Residuals and their scatter, for each observation."""
+    """Residuals of each observation and their statistics."""
     doubts: tuple[str, ...] = field(repr=False)
-    """Sentences about residuals that do not look like noise; the model's error then exceeds the error bars."""
+    """Sentences on residuals that do not look like noise. The error of the model is then larger than the error bars."""
     converged: bool = True
-    """True if the search ended at a minimum of the sum of squares; False if the search used all iterations."""
+    """True if the search ended at a minimum of the sum of squares, and False if it ran out of iterations."""
     tried: tuple[Tried, ...] = field(default=(), repr=False)
-    """All starts with the ends of their searches, including this fit's."""
+    """Starts and ends of all searches, including the search of this fit."""
     runs: int = 0
-    """Number of forward runs of single experiments."""
+    """Number of forward runs."""
     tangents: int = 0
-    """Number of forward-mode runs of single experiments along single tangents."""
+    """Number of forward-mode runs, each along one direction."""
     refused: int = 0
-    """Number of trial points that the fit did not use, because their runs diverged."""
+    """Number of trial points that were rejected because their runs diverged."""
     sum_of_squares: float = field(default=0.0, repr=False)
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
     at: Linearised | None = field(default=None, repr=False)
-    """The end of the search with the Jacobian of the error bars; None in pickled fits."""
+    """End of the search, with the Jacobian for the error bars. It is None in pickled fits."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None, "at": None}
 
     @property
     def values(self) -> dict[str, Any]:
-        """Return the fitted parameters by name: arrays, or numbers."""
+        """Return the fitted parameters by name, as arrays or numbers."""
         return _plain(self.coordinates.values(self.u))
 
     @property
     def labels(self) -> list[str]:
-        """Return the labels of the numbers that were searched, in the order of the covariance."""
+        """Return the labels of the fitted numbers, in the order of the covariance."""
         return self.coordinates.labels
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Return the covariance (free, free) of the numbers in the parameters' units, valid for small errors."""
+        """Return the covariance of the fitted numbers (free, free) in the units of the parameters. It is valid for
+        small errors."""
         slopes = self.coordinates.slopes(self.u)
         return self.coordinate_covariance * np.outer(slopes, slopes)
 
     @property
     def standard_errors(self) -> dict[str, Any]:
-        """Return standard errors by name, in the shape and the unit of the parameter; 0 for a number not searched."""
+        """Return the standard errors by name, in the shape and the unit of each parameter. They are 0 for components
+        that were not fitted."""
         return _plain(self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0))
 
     @property
@@ -149,15 +152,15 @@ class Fit:
 
     @property
     def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of labels whose estimates have a correlation of more than 0.9, with the correlation."""
+        """Return pairs of labels with strongly correlated estimates, each with the correlation, which is above 0.9."""
         found, labels = self.correlation, self.labels
         pairs = combinations(range(len(labels)), 2)
         return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > 0.9)
 
     def intervals(self, confidence: float = 0.95) -> dict[str, tuple[Any, Any]]:
-        """Return, by name, lower and upper ends of intervals that contain the true value with the probability
-        ``confidence``, if the model is right. Intervals of positive numbers are those of their logarithms. Raise
-        `InputError` for an unsuitable confidence."""
+        """Return the lower and upper ends of confidence intervals by parameter name. If the model is right, an interval
+        contains the true value with the probability ``confidence``. Intervals of positive numbers are computed for
+        their logarithms. Raises `InputError` for an unsuitable confidence."""
         if not 0.0 < as_one_number("confidence", confidence) < 1.0:
             raise InputError(f"confidence is {shown(confidence)}, but must be between 0 and 1.")
         from scipy.stats import t as student
@@ -168,9 +171,10 @@ class Fit:
         return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
-        """Compute the least sum of squares at ``points`` values of the number ``label``, with all other numbers fitted.
-        The values extend by ``reach`` standard errors to both sides. Intervals are rough unless the profile is a
-        parabola. Raise `InputError` for an unknown label, or if the fit was pickled."""
+        """Compute the least sum of squares at ``points`` values of the number ``label``. All remaining numbers are
+        fitted at each value. The values range from -``reach`` to +``reach`` standard errors around the estimate. If the
+        profile is not a parabola, the confidence intervals are rough. Raises `InputError` for an unknown label, or if
+        the fit was pickled."""
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
@@ -190,16 +194,16 @@ class Fit:
 
     def log_posterior(self, u: Any) -> float:
         """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,), for samplers.
-        A call takes a forward run.
+        Each call takes a forward run.
 
-        The prior is flat in the coordinates (logarithms of positive numbers) within the bounds. The result is -inf
-        out of bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to parameters. Raise
-        `InputError` for a wrong shape, or if the fit was pickled.
+        The prior is flat in the coordinates within the bounds. Coordinates of positive numbers are logarithms. The
+        result is -inf outside the bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to
+        parameters. Raises `InputError` for a wrong shape, or if the fit was pickled.
 
         The result is minus half of the weighted sum of squares, relative to the minimum. With correlated noise the
-        error bars, of covariance V, are longer than the curvature N of the sum of squares gives. Distances from the
-        estimate are therefore multiplied by the matrix W with W^T N W = V^-1, the curvature adjustment of Ribatet,
-        Cooley and Davison (2012).
+        error bars are longer than the sum of squares suggests. Let V be the covariance of the estimate, and N the
+        Hessian of the sum of squares. Distances from the estimate are multiplied by a matrix W with W^T N W = V^-1.
+        This is the curvature adjustment of Ribatet, Cooley and Davison (2012).
         """
         point = as_numbers("u", u)
         if point.shape != self.u.shape:
@@ -223,7 +227,7 @@ class Fit:
         return -0.5 * (squares - self.sum_of_squares)
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
-        """Return the fitted numbers with their `intervals` for a ``confidence``."""
+        """Return the fitted numbers with their confidence intervals."""
         ends = self.intervals(confidence)
         free = self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
@@ -232,7 +236,7 @@ class Fit:
         return [FittedNumber(label, *map(float, rest)) for label, *rest in each]
 
     def lines(self, confidence: float = 0.95) -> list[str]:
-        """Return a line for each number, with value, standard error, and interval for a ``confidence``."""
+        """Return a line of text for each fitted number, with its value, standard error and confidence interval."""
         return [
             f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
             for one in self.numbers(confidence)
@@ -240,7 +244,7 @@ class Fit:
 
     @property
     def in_doubt(self) -> bool:
-        """Return True if the fit has not converged, or there are doubts."""
+        """Return True if the fit has not converged or there are doubts."""
         return not self.converged or bool(self.doubts)
 
     def __repr__(self) -> str:
@@ -256,7 +260,7 @@ class Fit:
 
     @property
     def cautions(self) -> list[str]:
-        """Return sentences about correlated numbers, an early end, refused points, and doubts."""
+        """Return sentences on correlated numbers, an early end, rejected points, and doubts."""
         apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
         ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
         lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
@@ -269,7 +273,8 @@ def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error, with two digits of an error that begins with 1 to 3, or one digit."""
+    """Format a value and its standard error. The error has two digits if its first digit is 1 to 3, or else
+    one digit."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -280,7 +285,7 @@ def with_error(value: float, error: float) -> str:
 
 
 def unit_of(label: str) -> str:
-    """Return the unit of a fitted number by its label; empty without a unit."""
+    """Return the unit of the fitted number with this label, or an empty text."""
     name = label.partition("[")[0]
     return UNITS.get(name) or OF_VIEWS.get(name.rpartition(".")[2], "")
 
@@ -296,19 +301,23 @@ def fit(
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, with error bars.
 
-    A residual is a simulation's prediction minus the measured number. The search estimates the Jacobian by a forward
-    run for each fitted number, and at its end computes the Jacobian by forward mode. The first fit weights all
-    residuals equally. The scatter and correlation of the residuals give the weights of a second fit, whose residuals
-    give the error bars (see `cortado.optimisation.fitting.certainty`).
+    A residual is a simulation's prediction minus the measured number. The search estimates the Jacobian with one
+    forward run for each fitted number. At the end of the search the Jacobian is computed by forward mode. The first fit
+    weights all residuals equally, and its residuals determine the weights of a second fit. The residuals of the second
+    fit determine the error bars (see `cortado.optimisation.fitting.certainty`).
 
-    ``experiments``: a `measured.Experiment`, or several with the same parameters. ``start``: first values of the fitted
-    parameters, by name. Positive parameters, such as a viscosity, are searched by their logarithm. Parameters that
-    videos calibrate are added automatically, with the values of the cameras. ``bounds``: by name, (lower, upper), each
-    a number, an array of the parameter's shape, or None. A number with two equal bounds is not searched.
-    ``iterations``: greatest number of trial points of each of the two fits. ``on_trial``: called after each trial
-    point. ``starts``: number of starts, by default one, and three more if the first fit ends in doubt. Forward runs
-    choose further starts within the bounds, or within two decades to both sides of a positive number. The fit with the
-    least residuals is returned, and the fit's ``tried`` lists the ends of all searches.
+    Args:
+        experiments: a `measured.Experiment`, or several with the same parameters.
+        start: initial values of the fitted parameters, by name. Positive parameters, such as a viscosity, are searched
+            by their logarithm. Parameters that videos calibrate are added automatically, with the cameras' values.
+        bounds: by name, (lower, upper). Each is a number, an array in the shape of the parameter, or None. A number
+            with two equal bounds is not searched.
+        iterations: greatest number of trial points of each of the two fits.
+        on_trial: function that is called after each trial point.
+        starts: number of starts. The default is one start, and three more if the first fit ends in doubt. Additional
+            starts are chosen within the bounds by forward runs. Positive numbers without bounds are varied by a factor
+            of 100 in both directions. The fit with the least residuals is returned. Its ``tried`` lists the ends of all
+            searches.
 
     Raises InputError for unsuitable start, bounds or experiments, DivergedError if the run at the start diverges, and
     ComputationError if the measurements do not determine all parameters.
@@ -362,7 +371,6 @@ def fit(
 
 
 def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
-    """Fit from a start, first with equal weights, and again with weights from the residuals."""
     at = problem.estimated(start)
     sizes = [part.observation.noise or spread(r) or 1.0 for part, r in zip(problem.parts, at.residuals, strict=True)]
     weights = [Weighting(size) for size in sizes]
@@ -392,7 +400,7 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
-    """Return the searches that ended in other local minima, the lowest first."""
+    """Return the searches that ended in different local minima than ``found``, sorted by misfit."""
     bars = np.sqrt(np.diag(found.coordinate_covariance))
     near = SAME * np.where(found.coordinates.by_logarithm, 1.0, np.abs(found.u))
     others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]
@@ -400,7 +408,7 @@ def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
 
 
 def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
-    """Return a sentence about the lowest other local minimum, if it is nearly as likely."""
+    """Return a sentence on the second-lowest local minimum, if it is nearly as likely as the fit."""
     others, bars = elsewhere(found, tried), np.sqrt(np.diag(found.coordinate_covariance))
     if not others:
         return []

@@ -1,9 +1,9 @@
-"""Minimise the sum of squares in few runs, by Gauss-Newton steps with a Jacobian estimated from earlier runs.
+"""Minimise the sum of squares in few runs, by Gauss-Newton steps. The Jacobian is estimated from earlier runs.
 
-Predictions of particles are rough functions of a parameter. The derivative at a point may be many times steeper than
-the change over a standard error, so that error bars are too small. At the end of a search, `over_the_bars` therefore
-checks the tangents by predictions two standard errors away, and replaces bad tangents by differences over the width of
-the error bars.
+Predictions of particle simulations are rough functions of a parameter. The derivative at a point may be much steeper
+than the change over a standard error. Error bars from the derivative are then too small. At the end of a search,
+`over_the_bars` therefore checks the derivatives by predictions two standard errors away. Bad derivatives are replaced
+by differences over the width of the error bars.
 """
 
 from collections.abc import Sequence
@@ -18,26 +18,25 @@ from cortado.optimisation.fitting.certainty import Certainty, spread
 from cortado.optimisation.fitting.least_squares import TINY, LeastSquares, Linearised, TrialPoints, Weights
 
 GREATEST_LOGARITHM = 1.0
-"""Greatest change of a logarithm in a step."""
 MOST_FAILURES = 3
-"""Number of successive failed trial points after which the Jacobian is estimated again."""
+"""Number of successive failed trial points before the Jacobian is estimated again."""
 REACH = 2.0
-"""Distance [standard errors] of predictions that check tangents, about half the length of a 95 % interval."""
+"""Distance of the predictions that check derivatives [standard errors]."""
 
 
 @dataclass(frozen=True)
 class Searched:
     at: Linearised
-    """The last point that was run, with an estimated Jacobian."""
+    """Last point of the search, with an estimated Jacobian."""
     next: np.ndarray
-    """End (free,) of the next step, which was not run."""
+    """Next point of the search (free,), which was not run."""
     gain: float
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) -> tuple[Linearised, bool]:
-    """Minimise the sum of squares, first with estimated Jacobians, later with tangents. Return the minimum with its
-    tangents and True, or the lowest point and False."""
+    """Minimise the sum of squares, at first with estimated Jacobians and later with derivatives by forward mode. Return
+    the minimum and True. If there are not enough trial points, return the lowest point and False."""
     for _ in range(4):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, 9.0 / squares)  # a decrease of three standard errors
@@ -59,11 +58,11 @@ def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) 
 def search(
     problem: LeastSquares, at: Linearised, weights: Weights, trials: int, enough: float, fixed: Sequence[int] = ()
 ) -> Searched:
-    """Lower the sum of squares until a step is predicted to lower it by a fraction of at most ``enough``. The
-    coordinates with numbers in ``fixed`` do not change.
+    """Reduce the sum of squares until the predicted relative reduction of the next step is at most ``enough``. The
+    coordinates with indices in ``fixed`` do not change.
 
-    A trial point takes a forward run, and the Jacobian is estimated from all trial points (`TrialPoints`). Steps are
-    damped (Levenberg 1944, Marquardt 1963) after a point that is not lower or whose run diverges.
+    A trial point takes a forward run, and the Jacobian is estimated from all trial points. Steps are damped (Levenberg
+    1944, Marquardt 1963) after a point without a reduction or with a diverged run.
     """
     points, base = TrialPoints(problem, weights, at), 0
     failures, damping, lowest = 0, 0.0, problem.sum_of_squares(at.residuals, weights)
@@ -100,7 +99,8 @@ def search(
 def next_point(
     problem: LeastSquares, at: Linearised, weights: Weights, damping: float = 0.0, fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, float]:
-    """Minimise the linear model's sum of squares within the bounds; return the point (free,) and the decrease."""
+    """Minimise the linear model's sum of squares within the bounds. Return the point (free,) and the predicted
+    decrease."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
@@ -120,8 +120,8 @@ def next_point(
 
 
 def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tuple[Linearised, bool | None]:
-    """Return the end of a search with differences over the width of the error bars, and True if they converged; return
-    None if the tangents pass the check."""
+    """Check the derivatives at the end of a search. If the check succeeds, return the point and None. If it fails,
+    return the point with differences over the width of the error bars, and whether the differences converged."""
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -141,7 +141,8 @@ def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tu
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return independent moves by `REACH` standard errors as columns (free, free), at most as long as a search step."""
+    """Return independent moves by `REACH` standard errors as columns (free, free). Their length is at most a search
+    step."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.by_logarithm
@@ -150,7 +151,7 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray
 
 
 def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: np.ndarray) -> bool:
-    """Test if tangents predict the residuals at the end of an axis, on the side away from the start of the search."""
+    """Test whether the derivatives predict the residuals at the end of an axis."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= 1e-5 * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
         return True
@@ -169,8 +170,9 @@ def _differences(
 ) -> tuple[Linearised, list[Linearised]]:
     """Return the point with a Jacobian of differences along the axes, and the points that were run.
 
-    The smallest of two one-sided differences and a central difference is used, because the point may lie on a kink, or
-    in a minimum far narrower than the error bars."""
+    The smallest of the two one-sided differences and the central difference is used, because the point may lie on a
+    kink or in a very narrow minimum.
+    """
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
         ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
@@ -189,7 +191,8 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Return the point at ``shift`` within the bounds, with the present Jacobian; nothing if its run diverges."""
+    """Return the point moved by ``shift`` within the bounds, with the current Jacobian. The list is empty if the run
+    diverges."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -198,14 +201,16 @@ def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Lin
 
 
 def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
-    """Return the mean logarithm of the residuals' size, which is least at the maximum likelihood of Gaussian noise."""
+    """Return the mean logarithm of the residuals' size. For Gaussian noise it is least at the maximum of the
+    likelihood."""
     counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
     return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
 
 
 def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
-    """Return at most ``count`` points (free,) of a Sobol sequence, best first. The sequence covers the bounds, and two
-    decades to both sides of positive numbers without bounds; other numbers keep their start."""
+    """Return at most ``count`` points (free,) of a Sobol sequence, best first. The sequence covers the range between
+    the bounds. Positive numbers without bounds are varied by a factor of 100 in both directions, and the remaining
+    numbers are not varied."""
     from scipy.stats import qmc
 
     start, (lower, upper) = problem.coordinates.start, problem.coordinates.bounds

@@ -1,9 +1,9 @@
 """The least-squares problem of several experiments, as a function of one vector, and its Jacobians.
 
-The vector has the fitted numbers, or logarithms of positive numbers. The Jacobian is computed at the first point only;
-at trial points, slopes of an interpolation of the residuals by Kriging estimate the Jacobian (Sacks, Welch, Mitchell
-and Wynn 1989). The interpolation is a linear function plus a random function with Matérn covariance of index 7/2, whose
-width has the greatest likelihood.
+The vector has the fitted numbers, or logarithms of positive numbers. The Jacobian is computed only at the first point.
+At trial points it is estimated by the slopes of a Kriging interpolation of the residuals (Sacks, Welch, Mitchell and
+Wynn 1989). The interpolation is a linear function plus a random function with Matérn covariance of index 7/2. The width
+of the covariance is chosen by maximum likelihood.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,22 +20,21 @@ from cortado.scene.parameter_values import Arrays
 
 MOST_NUMBERS = 100
 DIFFERENCE = 0.02
-"""Step of a number's logarithm in a finite difference."""
 WIDTHS = (0.1, 1.0, 3.0)
-"""Widths of the covariance, relative to the greatest distance between two points."""
 TINY = 1e-300
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """All numbers (all,) of the parameters, of which those with different bounds are fitted (free,)."""
+    """The conversion between parameters and the coordinates of a search. All parameters have (all,) numbers in total.
+    Numbers with different lower and upper bounds are fitted (free,)."""
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
     at_start: np.ndarray
-    """First values (all,) [unit of the parameter]."""
+    """Initial values (all,), in the units of the parameters."""
     logarithmic: np.ndarray
-    """Mask (all,) of numbers that are fitted by their logarithm."""
+    """Mask of numbers that are fitted by their logarithm (all,)."""
     lower: np.ndarray
     upper: np.ndarray
 
@@ -47,8 +46,8 @@ class Coordinates:
         bounds: Mapping[str, tuple[Any, Any]] | None,
         unseen: Mapping[str, np.ndarray] | None = None,
     ) -> "Coordinates":
-        """Make coordinates for a start, with logarithms of ``positive`` parameters whose numbers are all above 0.
-        ``unseen`` numbers are not fitted. Raise `InputError` for unsuitable arguments."""
+        """Make coordinates for initial values. ``positive`` parameters are fitted by their logarithm if all of their
+        numbers are above 0. ``unseen`` numbers are not fitted. Raises `InputError` for unsuitable arguments."""
         require_table("start", start, "{'viscosity': 0.5}")
         values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
         given = {} if bounds is None else bounds
@@ -77,17 +76,17 @@ class Coordinates:
 
     @property
     def free(self) -> np.ndarray:
-        """Return a mask (all,) of fitted numbers."""
+        """Return a mask of fitted numbers (all,)."""
         return self.lower < self.upper
 
     @property
     def by_logarithm(self) -> np.ndarray:
-        """Return a mask (free,) of numbers that are fitted by their logarithm."""
+        """Return a mask (free,) of the fitted numbers that are fitted by their logarithm."""
         return self.logarithmic[self.free]
 
     @property
     def labels(self) -> list[str]:
-        """Return the names of parameters, with an index for parameters of several numbers, such as "gravity[1]"."""
+        """Return the names of the fitted numbers. Numbers of larger parameters have an index, as in "gravity[1]"."""
         every = [
             name if not shape else f"{name}[{', '.join(map(str, index))}]"
             for name, shape in zip(self.names, self.shapes, strict=True)
@@ -116,7 +115,7 @@ class Coordinates:
             return np.where(self.by_logarithm, np.exp(np.where(self.by_logarithm, u, 0.0)), u)
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivatives (free,) of numbers with respect to their coordinates."""
+        """Return the derivatives of the numbers with respect to their coordinates (free,)."""
         return np.where(self.by_logarithm, self.numbers(u), 1.0)
 
     def values(self, u: np.ndarray) -> Arrays:
@@ -129,7 +128,7 @@ class Coordinates:
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
     def directions(self, u: np.ndarray) -> list[Arrays]:
-        """Return the derivative of the parameters with respect to each coordinate, without those that are 0."""
+        """Return the derivative of the parameters with respect to each coordinate. Zero derivatives are left out."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
             whole = np.zeros(len(self.at_start))
@@ -138,7 +137,7 @@ class Coordinates:
         return found
 
     def spread(self, free: np.ndarray, otherwise: float) -> Arrays:
-        """Return fitted numbers (free,) as arrays by name, filled with ``otherwise`` for other numbers."""
+        """Return fitted numbers (free,) as arrays by name. Numbers that are not fitted are set to ``otherwise``."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
@@ -160,7 +159,8 @@ def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarr
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Return values (frames, ...) minus their prediction from the previous frame, with unchanged standard deviation."""
+    """Remove the correlation of values (frames, ...) between successive frames. The standard deviation does
+    not change."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -169,7 +169,8 @@ def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> 
 
 @dataclass(frozen=True)
 class Part:
-    """An observation of an experiment of a fit; ``label``: name, and number of the experiment among several."""
+    """An observation of an experiment. ``label`` has its name, and the number of the experiment if there are
+    several."""
 
     experiment: int
     name: str
@@ -179,7 +180,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Weighting:
-    """A scale [unit of the observation] that divides residuals, and a correlation time [s] that whitens them."""
+    """The weighting of an observation's residuals: a scale in the unit of the observation, and a correlation
+    time [s]."""
 
     scale: float
     correlation_time: float = 0.0
@@ -190,18 +192,18 @@ class Weighting:
 
 
 Weights = Sequence[Weighting]
-"""A weighting for each part."""
+"""A weighting for each observation."""
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and Jacobians of all parts at coordinates u (free,), in the units of the measurements."""
+    """Residuals and Jacobians of all observations at coordinates u (free,), in the units of the measurements."""
 
     u: np.ndarray
     residuals: list[np.ndarray]
-    """Predicted minus measured numbers (frames, m) of each part; 0 for ignored numbers."""
+    """Predicted minus measured numbers of each observation (frames, m). They are 0 for ignored numbers."""
     jacobians: list[np.ndarray]
-    """Jacobian (frames, m, free) of each part."""
+    """Jacobian of each observation (frames, m, free)."""
 
 
 def weighted(parts: Sequence[Part], weights: Weights, values: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -222,14 +224,14 @@ class LeastSquares:
             for name, one in experiment.observations.items()
         ]
         self.runs = self.tangents = self.refused = 0
-        """Numbers of forward runs, of forward-mode runs, and of diverged runs of single experiments."""
+        """Number of forward runs, followed by the numbers of forward-mode runs and of diverged runs."""
 
     @property
     def labels(self) -> list[str]:
         return self.coordinates.labels
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
-        """Return the residuals of each part at u; raise `DivergedError` if a run diverges."""
+        """Return the residuals of each observation at coordinates u. Raises `DivergedError` if a run diverges."""
         found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
@@ -239,8 +241,9 @@ class LeastSquares:
         return self._along(u, range(len(u)))
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """Return residuals and estimated Jacobians at a point; raise `DivergedError`. Derivatives with respect to
-        positive numbers are differences, because a forward run costs less than a forward-mode run."""
+        """Return residuals and estimated Jacobians at a point. Derivatives with respect to positive numbers are
+        differences, because forward runs are cheaper than forward-mode runs. Raises `DivergedError` if a run diverges.
+        """
         positive = self.coordinates.by_logarithm
         at = self._along(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
@@ -272,7 +275,7 @@ class LeastSquares:
         return Linearised(u.copy(), residuals, jacobians)
 
     def stacked(self, at: Linearised, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-        """Return the weighted Jacobian (numbers, free) and residuals (numbers,) of all parts."""
+        """Return the weighted Jacobian (numbers, free) and residuals (numbers,) of all observations."""
         J = [own.reshape(-1, len(at.u)) for own in weighted(self.parts, weights, at.jacobians)]
         return np.concatenate(J), np.concatenate([r.ravel() for r in weighted(self.parts, weights, at.residuals)])
 
@@ -289,7 +292,8 @@ class LeastSquares:
             raise
 
     def values_of(self, experiment: int, values: Arrays) -> Arrays:
-        """Return the values of an experiment's parameters, without those of other experiments' observations."""
+        """Return the values of an experiment's parameters, without the parameters of observations in the remaining
+        experiments."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
 
@@ -315,7 +319,7 @@ class TrialPoints:
 
     @property
     def are_many(self) -> bool:
-        """Return True if the points need too much memory, so that the search should restart from the lowest point."""
+        """Return True if the points need too much memory. The search should then start again at the lowest point."""
         return len(self._points) >= 5 * (len(self._points[0]) + 1)
 
     def linearised(self, number: int) -> Linearised:
@@ -329,8 +333,8 @@ class TrialPoints:
 
 
 def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
-    """Return weights (d, points) of the values at points ``x`` (points, d) for the slopes of the interpolation at point
-    ``number``. ``products``: products (points, points) of values at two points, summed over all residuals."""
+    """Return the weights (d, points) for the slopes of the interpolation at point ``number``. They multiply the values
+    at all points ``x`` (points, d)."""
     from scipy.spatial.distance import cdist
 
     points, d = x.shape
@@ -346,13 +350,12 @@ def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarra
 
 
 def _covariance(apart: np.ndarray) -> np.ndarray:
-    """Return the Matérn covariance (points, points) for distances ``apart``, in units of the width."""
+    """Return the Matérn covariance (points, points) for distances in units of the width."""
     smooth = (1.0 + apart + 0.4 * apart**2 + apart**3 / 15.0) * np.exp(-apart)
     return smooth + 1e-12 * np.eye(len(apart))
 
 
 def _most_likely_width(apart: np.ndarray, linear: np.ndarray, products: np.ndarray) -> float:
-    """Return the width of greatest likelihood, from contrasts of values that linear functions do not change."""
     from scipy.linalg import null_space
 
     contrasts = null_space(linear.T)

@@ -1,4 +1,4 @@
-"""Observations of an experiment and their predictions by a simulation: videos, sensor series, and tracks of tracers."""
+"""Observations of an experiment and their predictions: videos, sensor series, and tracks of tracers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,46 +22,46 @@ from cortado.scene.parameter_values import Arrays
 from cortado.simulation import Simulation
 
 CLOCK = "start"
-"""Name of an observation's clock parameter, which shifts the times of its frames."""
+"""Name of the parameter that shifts the times of an observation's frames."""
 LEAST_FRAMES = 4
 
 
 @dataclass(frozen=True)
 class Direction:
-    """The direction of a directional derivative of an observation's prediction at a state."""
+    """A direction for the derivative of an observation's prediction."""
 
     fields: Arrays
     """Tangents of the state's fields by name, such as positions (n, d) and mass fractions (n, phases)."""
     parameters: Mapping[str, np.ndarray]
-    """Direction of the simulation's parameters by name."""
+    """Components of the direction for the simulation's parameters, by name."""
     own: Mapping[str, np.ndarray]
-    """Direction of the observation's parameters by name."""
+    """Components of the direction for the observation's parameters, by name."""
     quantities: Callable[[Iterable[str]], Arrays]
-    """Function from names of quantities of particles to their tangents."""
+    """Function that returns the tangents of particle quantities with the given names."""
 
 
 class Observation(Protocol):
-    """Protocol of an observation: numbers measured at several times (frames), and their prediction from a state."""
+    """Protocol of an observation: numbers measured at several times (frames), and the prediction of these numbers."""
 
     times: np.ndarray
     """Increasing times (frames,) [s] after the start of the run."""
     measured: np.ndarray
-    """Measured numbers (frames, m); NaN for numbers to ignore."""
+    """Measured numbers (frames, m). NaN values are ignored."""
     noise: float | None
-    """Standard deviation of a number; None to estimate it from the residuals."""
+    """Standard deviation of a measured number, or None to estimate it from the residuals."""
     unit: str
-    """Unit of the numbers."""
+    """Unit of the measured numbers."""
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return first values of the observation's parameters, such as a camera's. A parameter called "start" is a
-        clock [s] that is added to the times of the frames."""
+        """Return the initial values of the observation's parameters, such as the position of a camera. The parameter
+        "start" is a clock [s], which is added to the times of the frames."""
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the predicted numbers (m,) at a state, for values ``own`` of the observation's parameters."""
+        """Return the predicted numbers (m,) for a state. ``own`` has the values of the observation's parameters."""
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives (m, directions) of `value` along directions."""
+        """Return the derivatives of `value` (m, directions) along directions."""
 
 
 class Again:
@@ -79,16 +79,16 @@ class Again:
 
 @dataclass(frozen=True)
 class Frames:
-    """Times of an observation's frames, for linear interpolation between the states of a run."""
+    """Frames of an observation, for linear interpolation between the states of a run."""
 
     steps: np.ndarray
-    """Number of steps (frames,) before each frame."""
+    """Number of steps before each frame (frames,)."""
     shares: np.ndarray
-    """Interpolation weight (frames,) of the state after the next step, from 0 to 1."""
+    """Interpolation weight of the later state, from 0 to 1 (frames,)."""
 
     @classmethod
     def of(cls, times: np.ndarray, time_step: float, steps: int) -> "Frames":
-        """Make frames for times [s]; raise `InputError` for times beyond the run."""
+        """Make frames for times [s]. Raises `InputError` for times after the end of the run."""
         places = times / time_step
         if places[-1] > steps + 1e-6:
             raise InputError(
@@ -107,11 +107,12 @@ class Frames:
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return rates of change (frames, ...) [1/s] of readings by step number."""
+        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` has readings by step
+        number."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Interpolate readings by step number to the frames (frames, ...)."""
+        """Return readings interpolated to the frames (frames, ...). ``read`` has readings by step number."""
         last = max(read)
         after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
@@ -120,7 +121,8 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock; raise `InputError` if it must be ``alone`` and is not."""
+    """Return the parameter of a calibrated clock. If ``alone`` is true, further names in ``calibrate`` raise
+    `InputError`."""
     for name in calibrate if alone else ():
         if name != CLOCK:
             raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
@@ -128,7 +130,7 @@ def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Return times plus ``clock`` [s], numbers and noise; raise `InputError` for unsuitable arrays."""
+    """Return times plus ``clock`` [s], measured numbers and noise. Raises `InputError` for unsuitable arrays."""
     moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
     values = read_only("measured", measured)
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
@@ -153,7 +155,7 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
 
 @fixed
 class Video:
-    """An observation of a fit: the frames of a video, compared with pictures of the simulation.
+    """A video as an observation of a fit. Its frames are compared with pictures of the simulation.
 
     Example: ``video = cortado.measured.Video(simulation.renderer(resolution=(64, 64)), times, frames)``
     """
@@ -170,11 +172,18 @@ class Video:
         calibrate: tuple[str, ...] | list[str] = (),
         clock: float = 0.0,
     ):
-        """Store a ``renderer`` from `Simulation.renderer` with the camera's measured position. ``times`` (frames,) [s]
-        begin at the start of the run. ``frames`` (frames, rows, columns, 3): linear light from 0 to 1, see
-        `cortado.pictures.read_picture`. ``mask`` (rows, columns): true for pixels to use. ``noise``: standard deviation
-        of a number, if known. ``calibrate``: view parameters to fit too: "translation", "rotation", "field_of_view" or
-        "width", "extinction", and "start", the ``clock`` [s] added to the times."""
+        """Store a video.
+
+        Args:
+            renderer: from `Simulation.renderer`, with the camera's measured position.
+            times: (frames,) [s] after the start of the run.
+            frames: (frames, rows, columns, 3), linear light from 0 to 1; see `cortado.pictures.read_picture`.
+            mask: (rows, columns), true for pixels to use.
+            noise: standard deviation of the light in a pixel, if known.
+            calibrate: additional parameters to fit: "translation", "rotation", "field_of_view" or "width",
+                "extinction", and "start" for the clock.
+            clock: [s], added to the times.
+        """
         require_methods("renderer", renderer, ("render", "tangent", "seen_by"), "a renderer such as of a Simulation")
         pictures = as_numbers("frames", frames)
         if pictures.shape[1:] != renderer.shape:
@@ -192,16 +201,16 @@ class Video:
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return first values of the calibrated parameters of camera and clock."""
+        """Return the initial values of the calibrated parameters of camera and clock."""
         return {**self.calibration.start, **self._clock}
 
     @property
     def unseen(self) -> Mapping[str, np.ndarray]:
-        """Return masks by name, true for camera parameters that do not affect the picture."""
+        """Return a mask for each camera parameter. It is true for components that do not affect the picture."""
         return self.calibration.unseen
 
     def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the picture (rows, columns, 3) of a state, for values ``own`` of calibrated parameters."""
+        """Return the picture of a state (rows, columns, 3). ``own`` has the values of calibrated parameters."""
         return self._renderer(own).render(at.state.positions, at.state.mass_fractions, at.colours)
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -227,7 +236,7 @@ class Video:
 
 @fixed
 class SensorSeries:
-    """An observation of a fit: the numbers that a sensor measured over time.
+    """A time series of sensor readings as an observation of a fit.
 
     Example: ``series = cortado.measured.SensorSeries(gauge, times, heights, dimension=2, noise=0.001)``
     """
@@ -243,10 +252,18 @@ class SensorSeries:
         calibrate: Sequence[str] = (),
         clock: float = 0.0,
     ):
-        """Store a ``sensor`` of `cortado.sensors` and its readings ``values`` (frames,) or (frames, k) in the sensor's
-        units, NaN to ignore one, at ``times`` (frames,) [s] after the start of the run. ``dimension``: of the scene.
-        ``columns``: names of the k measured columns, by default all. ``noise``: standard deviation, if known. ``clock``
-        [s] is added to the times; ``calibrate=["start"]`` fits it."""
+        """Store a measured series.
+
+        Args:
+            sensor: a sensor of `cortado.sensors`.
+            times: (frames,) [s] after the start of the run.
+            values: readings (frames,) or (frames, k) in the sensor's units. NaN readings are ignored.
+            dimension: dimension of the scene.
+            columns: names of the k measured columns, by default all.
+            noise: standard deviation of a reading, if known.
+            calibrate: ["start"] to fit the clock.
+            clock: [s], added to the times.
+        """
         self.start = clock_of(calibrate, clock)
         self.sensor = checked_sensor(sensor)
         known = dict(sensor.columns(dimension))
@@ -269,7 +286,8 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives along directions by adjoints of the numbers, because sensors have no forward mode."""
+        """Return the derivatives along directions. They are computed by adjoints, because sensors have no
+        forward mode."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
@@ -281,13 +299,14 @@ class SensorSeries:
 
 @fixed
 class Tracks:
-    """An observation of a fit: positions of tracers over time. A tracer moves with the particles around its first
+    """Positions of tracers over time, as an observation of a fit. A tracer moves with the particles around its initial
     position:
 
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 
-    with Wendland's weights (1995) at the start, normalised to sum 1 within the support radius. Weights include periodic
-    images of particles. Paths are not wrapped: a tracer that crossed a periodic box is one period further.
+    where X is the position of the tracer, and x_i are the positions of the particles and their periodic images. The
+    weights w_i are Wendland's function (1995) within the support radius at the start, normalised to sum 1. Paths are
+    not wrapped: the position of a tracer that crossed a periodic box is one period further.
 
     Example: ``tracks = cortado.measured.Tracks(simulation, first, times, positions, noise=0.001)``
     """
@@ -304,10 +323,17 @@ class Tracks:
         calibrate: Sequence[str] = (),
         clock: float = 0.0,
     ):
-        """Store the tracers' ``first`` positions (tracers, d) [m], and ``positions`` (frames, tracers, d) [m] at
-        ``times`` (frames,) [s] after the start of the run, NaN for unseen tracers. ``noise``: standard deviation of a
-        coordinate [m], if known. ``clock`` [s] is added to the times; ``calibrate=["start"]`` fits it. Raise
-        `InputError` if a tracer has no fluid around it."""
+        """Store the tracks of tracers. Raises `InputError` if a tracer has no fluid around it.
+
+        Args:
+            simulation: simulation of the experiment.
+            first: (tracers, d) initial positions of the tracers [m].
+            times: (frames,) [s] after the start of the run.
+            positions: (frames, tracers, d) [m], NaN for unseen tracers.
+            noise: standard deviation of a coordinate [m], if known.
+            calibrate: ["start"] to fit the clock.
+            clock: [s], added to the times.
+        """
         self.start = clock_of(calibrate, clock)
         begun, places = as_numbers("first", first), as_numbers("positions", positions)
         tracers, d = begun.shape if begun.ndim == 2 else (0, 0)

@@ -1,1 +1,1 @@
-"""Cortado as a layer of other programs: functions of named arrays, with derivatives, and the bridges to programs."""
+"""Cortado as a layer of other programs: differentiable functions of named arrays, and bridges to JAX and PyTorch."""

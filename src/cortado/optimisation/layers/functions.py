@@ -1,4 +1,4 @@
-"""The layers of a simulation: steps, the loss of a problem, sensor readings, and pictures."""
+"""Layers that compute steps, the loss of a problem, sensor readings, and pictures."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -45,7 +45,7 @@ LOSS, READING, PICTURE = "loss", "reading", "picture"
 
 
 class OfSimulation(Layer):
-    """Base class of layers whose arrays are a state of a simulation, and parameters over a number of steps."""
+    """Base class of layers with a state and parameters of a simulation as arguments."""
 
     def __init__(self, simulation: Simulation, steps: int, each: bool = False):
         super().__init__()
@@ -66,7 +66,6 @@ class OfSimulation(Layer):
         self._parameters.check(given, with_state=True)
 
     def _last_step(self) -> dict[str, Array]:
-        """Return a zero adjoint of the last step's length, which has no derivative, if states have this array."""
         return {LAST_STEP: np.zeros(self.states.shapes[LAST_STEP])} if LAST_STEP in self.states.shapes else {}
 
 
@@ -123,7 +122,7 @@ class Evaluation:
 
     @property
     def gradient(self) -> Arrays:
-        """Return the loss's derivatives by names of arrays, in float64; in a batch with a first axis for the scenes."""
+        """Return the gradient of the loss by array name, in float64. In a batch the first axis is the scene."""
         if self._found is None:
             assert self._run is not None and isinstance(self._estimator, AdjointEstimator)
             if self._with_state:
@@ -136,7 +135,7 @@ class Evaluation:
         return self._found
 
     def along(self, dots: Named) -> Any:
-        """Return the derivative of the loss along tangents, by forward mode unless an estimator was given."""
+        """Return the derivative of the loss along tangents. Without a given estimator, forward mode is used."""
         if isinstance(self._estimator, Exact) and not self._with_state and self._found is None:
             return self._problem.tangent(self.values, part(dots, PARAMETER))
         terms = [self.gradient[name] * dot for name, dot in dots.items()]
@@ -144,7 +143,7 @@ class Evaluation:
 
 
 class Value(OfSimulation):
-    """A layer of parameters, and optionally of a problem's first state, whose result is the problem's loss."""
+    """A layer that computes the loss of a problem. Its arguments are parameters and, optionally, an initial state."""
 
     def __init__(self, problem: Problem, gradient: GradientEstimator | None = None, each: bool = False):
         if not isinstance(problem, Problem):
@@ -193,7 +192,7 @@ class Value(OfSimulation):
         return {LOSS: np.where(self._moved(dots), found, 0.0)}
 
     def _moved(self, dots: Named) -> Any:
-        """Return True, (batch,) or (), for scenes with a tangent other than 0, also a shared one."""
+        """Return True for scenes with a non-zero tangent. The shape is () or (batch,)."""
         found = np.zeros(self.outputs()[LOSS], dtype=bool)
         for name, dot in dots.items():
             array = on_host(dot)
@@ -209,7 +208,8 @@ class Value(OfSimulation):
 
 
 def _times(found: np.ndarray, bar: Any) -> np.ndarray:
-    """Return ``found`` times ``bar`` of each scene, and 0 where ``bar`` is 0 and ``found`` NaN."""
+    """Multiply ``found`` by the adjoint ``bar`` of each scene. The product is 0 where ``bar`` is 0, even if ``found``
+    is NaN."""
     factor = np.reshape(bar, (*np.shape(bar), *(1,) * (found.ndim - np.ndim(bar))))
     return np.where(factor == 0.0, 0.0, found) * factor
 
@@ -222,8 +222,8 @@ class Look:
 
 
 class Measure(OfSimulation):
-    """A layer that reads a sensor, or a quantity of the particles by name, from a state and parameters of the next
-    step."""
+    """A layer that computes a sensor reading or a particle quantity. Its arguments are a state and the parameters of
+    the next step."""
 
     def __init__(self, simulation: Simulation, what: Sensor | str):
         if simulation.batch is not None:
@@ -291,8 +291,8 @@ class Measure(OfSimulation):
 
 
 class Picture(Layer):
-    """A layer that renders pictures of positions (n, d) [m], and optionally mass fractions (n, phases) and colours
-    (phases, 3), on the host."""
+    """A layer that renders pictures on the host. Its arguments are positions (n, d) [m] and, optionally, mass fractions
+    (n, phases) and colours (phases, 3)."""
 
     def __init__(self, renderer: Renderer):
         super().__init__()

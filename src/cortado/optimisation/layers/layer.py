@@ -1,6 +1,6 @@
 """Base classes of layers, which are differentiable functions of named arrays, and converters of states and parameters.
 
-Parameters are equal for all evaluations of a layer, or have an entry for each evaluation.
+If a layer is evaluated several times together, a parameter has either one value, or one value for each evaluation.
 """
 
 import warnings
@@ -28,14 +28,13 @@ from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.simulation import Simulation
 
 STATE, PARAMETER = "state ", "parameter "
-"""Prefixes of array names for fields of a state and for parameters, also in error messages."""
+"""Prefixes of the names of arrays, for fields of a state and for parameters."""
 POSITIONS = (STATE + "positions", "positions")
-"""Names of the positions in layers whose arrays include particles."""
 LAST_STEP = "time_step"
-"""Name of the length [s] of the step before a state, in a scene with adaptive time steps."""
+"""Name of the length of the previous time step [s], for scenes with adaptive time steps."""
 KEPT = 2
 Array = Any
-"""A Warp or NumPy array of numbers; an array of shape () may also have shape (1,)."""
+"""A Warp or NumPy array of numbers. A scalar has the shape () or (1,)."""
 Named = Mapping[str, Array]
 Shapes = Mapping[str, tuple[int, ...]]
 K = TypeVar("K")
@@ -43,15 +42,15 @@ V = TypeVar("V")
 
 
 class Layer(ABC):
-    """A function of named arrays of one precision, with derivatives. Given arrays are not modified."""
+    """A differentiable function of named arrays in one precision. It does not modify its arguments."""
 
     real: type
     device: Any
-    """Device of the arrays in `on_device`; other arrays are read on the host."""
+    """Device of the arrays named in `on_device`. The remaining arrays are on the host."""
     on_device: frozenset[str] = frozenset()
     kept_bytes: int = 0
     unmapped: str = ""
-    """Name of the layer in messages if `many` is unavailable; else empty."""
+    """Name of the layer in the error message of `many`. Empty if `many` is available."""
 
     def __init__(self) -> None:
         self._batched: dict[int, Layer] = {}
@@ -66,15 +65,17 @@ class Layer(ABC):
 
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Return the layer's results, and a residual for `pull` and `push` if ``keep`` is true."""
+        """Return the results of the layer. If ``keep`` is true, also return a residual for `pull` and `push`."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
-        """Return adjoints of all given arrays for adjoints of the results, 0 for missing names (reverse mode)."""
+        """Compute the vector-Jacobian product: return the adjoints of all arguments, given the adjoints of the results.
+        Missing names count as 0."""
 
     @abstractmethod
     def push(self, residual: Any, dots: Named) -> Named:
-        """Return tangents of the results for tangents of given arrays, 0 for missing names (forward mode)."""
+        """Compute the Jacobian-vector product: return the tangents of the results, given the tangents of the arguments.
+        Missing names count as 0."""
 
     def check_mapped(self) -> None:
         """Raise `InputError` if `many` is unavailable."""
@@ -84,24 +85,24 @@ class Layer(ABC):
             )
 
     def many(self, size: int) -> "Layer":
-        """Return a layer of ``size`` evaluations, with arrays stacked along a first axis."""
+        """Return a layer that computes ``size`` evaluations of this layer. Arrays are stacked along a first axis."""
         return OneByOne(self, size)
 
     def batched(self, size: int) -> "Layer":
-        """Return the layer of `many`, from a cache."""
+        """Return the cached result of `many`."""
         self.check_mapped()
         return kept_or_made(self._batched, size, self.many, KEPT)
 
 
 @dataclass(frozen=True)
 class Lost:
-    """The residual of a diverged evaluation among several, with shapes of the ``given`` arrays, and the reason."""
+    """The residual of a diverged evaluation, with the shapes of its arrays and the reason."""
 
     given: Shapes
     why: str
 
     def along(self, of: Named, shapes: Shapes) -> Named:
-        """Return derivatives of given ``shapes``: 0 if all arrays ``of`` are 0, else NaN."""
+        """Return derivatives with the given ``shapes``. They are 0 if all arrays in ``of`` are 0, or else NaN."""
         number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
         return {name: np.full(shape, number) for name, shape in shapes.items()}
 
@@ -129,7 +130,7 @@ class OneByOne(Layer):
         return stacked([one for one, _ in found]), [residual for _, residual in found] if keep else None
 
     def _evaluated(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Evaluate an entry; results are NaN if positions are NaN or a particle is lost."""
+        """Compute one of several evaluations. The results are NaN if positions are NaN or a particle is lost."""
         shapes = {name: np.shape(array) for name, array in given.items()}
         positions = next((array for name, array in given.items() if name in POSITIONS), np.zeros(1))
         lost = Lost(shapes, "its particles had been lost in steps before it.")
@@ -156,7 +157,7 @@ class OneByOne(Layer):
 
 
 def kept_or_made(kept: dict[K, V], key: K, make: Callable[[K], V], most: int) -> V:
-    """Return the value of a key, or make it; keep the ``most`` last used values."""
+    """Return the cached value of a key, or make the value. The cache has at most ``most`` values."""
     found = kept.pop(key, None) or make(key)
     kept[key] = found  # as the last used value
     while len(kept) > most:
@@ -181,7 +182,7 @@ def rows(given: Named, chosen: int | np.ndarray) -> dict[str, Array]:
 
 
 def stacked(found: Iterable[Named]) -> dict[str, Array]:
-    """Stack the arrays of several tables by name along a first axis, on the device of the first table."""
+    """Stack the arrays of several tables by name, along a new first axis."""
     tables = list(found)
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
@@ -210,10 +211,10 @@ def _stack(arrays: list[Array]) -> Array:
 
 
 class NamedStates(HostStates):
-    """The interface of steps to states and derivatives as named arrays in the simulation's precision.
+    """A converter between states of a simulation and named arrays, for states and derivatives.
 
-    The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]; in a batch they have a
-    first axis for the scenes. On a GPU, states and derivatives are not checked, to avoid copies to the host.
+    The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]. In a batch the first
+    axis is the scene. On a GPU, states and derivatives are not checked, to avoid copies to the host.
     """
 
     def __init__(self, simulation: Simulation):
@@ -221,7 +222,7 @@ class NamedStates(HostStates):
         self._simulation: Simulation = simulation
         self._space, self._is_cpu = ParameterSpace(simulation, 0), bool(simulation.device.is_cpu)
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
-        """Origins of particles of valid states, by checksum."""
+        """Origins of the particles of valid states, by the checksum of the state."""
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -236,13 +237,13 @@ class NamedStates(HostStates):
         return self._simulation.initial.names
 
     def begin(self, space: ParameterSpace, rollout: Rollout, state: Named, values: Arrays, varied: set[str]) -> None:
-        """Set the first state and checked parameters of a rollout; raise `InputError` for a state that is impossible
-        in this scene."""
+        """Set the initial state and the checked parameters of a rollout. Raises `InputError` if the state does not suit
+        the scene."""
         scenes = self._judged(state, values)
         space.begin(rollout, values, varied, scenes, lambda first: self._copy_to(first, state))
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
-        """Copy the state of a rollout after ``steps`` steps to named arrays, NaN for lost scenes."""
+        """Copy the state of a rollout after ``steps`` steps to named arrays. Lost scenes get NaN."""
         fields = self.read(state, dict.fromkeys(rollout.lost, np.nan))
         clocks = [scene.clock for scene in scenes_after(rollout, steps)]
         return self._with_clocks(fields, clocks, rollout.origins)
@@ -253,8 +254,8 @@ class NamedStates(HostStates):
         return self._with_clocks(self.read(state.arrays, {}), [one.clock for one in state.scenes], origins)
 
     def restart_states(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
-        """Return restart states of all scenes before steps with parameter ``values``; raise `InputError` for a state
-        that is impossible in this scene."""
+        """Return the restart states of all scenes, given the parameter ``values`` of the next steps. Raises
+        `InputError` if a state does not suit the scene."""
         judged = self._judged(given, values)
         found = tuple(self._states(given, [one.clock for one in judged], [one.origin for one in judged]))
         self._simulation.judged_states.update(found)
@@ -297,7 +298,7 @@ class NamedStates(HostStates):
         return found
 
     def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
-        """Return the clocks and origins of all scenes as restart states without fields."""
+        """Return restart states of all scenes with clocks and origins, but without fields."""
         solver = self._simulation.scene.solver
         times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
         steps = np.full(times.shape, values.get("time_step", 1.0 if solver.chooses else solver.time_step))
@@ -327,13 +328,12 @@ class NamedStates(HostStates):
         return [RestartState(*own).fixed() for own in zip(each, clocks, origins, strict=True)]
 
     def _numbers(self, given: Named, name: str) -> np.ndarray:
-        """Return a named array as numbers (members,) in float64, by default 0."""
         members = self._simulation.batch or 1
         return on_host(given[name]).astype(np.float64).reshape(members) if name in given else np.zeros(members)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
-        """Return the clock of a state at a possibly rounded time [s]. If the time is a multiple of the ``step``, the
-        clock counts steps, so that later times have the bits of a single run."""
+        """Return the clock of a state at a time [s], which may be rounded. If the time is a multiple of the time step
+        ``step``, the clock counts steps. Later times then have the same bits as in a single run."""
         if self._simulation.scene.solver.chooses:
             return Clock(0, time, last)
         steps = round(time / step) if np.isfinite(time) and time >= 0.0 else 0
@@ -346,7 +346,6 @@ class NamedStates(HostStates):
             self._known.popitem(last=False)
 
     def _checksum(self, fields: Named) -> bytes:
-        """Return a checksum of a state's numbers in the simulation's precision."""
         found, real = blake2b(digest_size=16), self._simulation.precision.numpy
         for name in self.fields:
             found.update(np.ascontiguousarray(fields[name], dtype=real).data)
@@ -370,10 +369,10 @@ def named_states(simulation: Simulation) -> NamedStates:
 
 
 class LayerParameters:
-    """A converter of a layer's parameters over a number of steps to the forms of problems and steppers.
+    """A converter of a layer's parameters for problems and steppers.
 
-    ``each``: True if the simulation is a batch of evaluations of a layer, and all arrays have an entry for each
-    evaluation. Other batches have parameters in all shapes of `docs/batches.md`.
+    ``each`` is True if the simulation is a batch of evaluations of a layer. All arrays then have one entry for each
+    evaluation. If ``each`` is False, a batch accepts parameters in all shapes of `docs/batches.md`.
     """
 
     def __init__(self, simulation: Simulation, steps: int, each: bool):
@@ -400,8 +399,6 @@ class LayerParameters:
         return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
 
     def _shaped(self, name: str, array: Array) -> Array:
-        """Return a parameter's array, with an axis for steps added if an evaluation's value is the same in all
-        steps."""
         shapes = self._space.shapes(name)
         if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
             return array.reshape((array.shape[0], 1, *array.shape[1:]))
@@ -409,7 +406,7 @@ class LayerParameters:
         return array.reshape(()) if is_number else array
 
     def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
-        """Return derivatives in the shapes of ``values``, summed over scenes that share a value."""
+        """Return derivatives in the shapes of ``values``. If scenes share a value, their derivatives are summed."""
         shared = {}
         for name, bar in found.items():
             if isinstance(bar, np.ndarray):

@@ -1,5 +1,5 @@
-"""The functions of `cortado.jax` and `cortado.torch`: states, steps, rollouts and losses of arrays, and smoothed losses
-of closed loops."""
+"""The functions of `cortado.jax` and `cortado.torch`: states, steps, rollouts and losses as functions of arrays, and
+smoothed losses of closed loops."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -30,19 +30,18 @@ KEPT = 4
 
 
 class Bridge(ABC):
-    """Base class of the functions of JAX or PyTorch for layers."""
+    """Base class of the code that is specific to JAX or PyTorch."""
 
     stack: Callable[[list[Any]], Any]
-    """Function that stacks arrays along a first axis."""
 
     @abstractmethod
     def apply(self, layer: Layer, given: dict[str, Any]) -> dict[str, Any]:
-        """Return the results of a layer by name, as a differentiable function of arrays by name."""
+        """Return the results of a layer by name, as a differentiable function of the given arrays."""
 
     @abstractmethod
     def array(self, what: str, value: Any, layer: Layer) -> Any:
-        """Return an array of the layer's precision unchanged, or convert numbers to an array; raise `InputError` for
-        anything else."""
+        """Return an array of the layer's precision unchanged, or convert numbers to an array. Raises `InputError` for
+        any other value."""
 
     @abstractmethod
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
@@ -50,23 +49,23 @@ class Bridge(ABC):
 
     @abstractmethod
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Return a function of k weights and k first positions, along a first axis, whose results are the losses (k,)
-        and, with ``slope``, their gradients by name."""
+        """Return a function that evaluates a loss for k weights and k initial positions, along a first axis. It returns
+        the losses (k,), and their gradients by name if ``slope`` is true."""
 
     @abstractmethod
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value of a function at ``weights`` as an array of JAX or PyTorch, with its gradient in reverse
-        mode."""
+        """Return the value of a function at ``weights`` as an array of JAX or PyTorch. In reverse mode the array has
+        the function's gradient."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
-        """Copy an array to the host in float64; raise `InputError` for anything else."""
+        """Copy an array to the host in float64. Raises `InputError` for any other value."""
         return as_precise_numbers(what, value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Apply a step repeatedly, with the next row of each array in ``rows``; return all states along a first
-        axis."""
+        """Apply a step ``count`` times, each time with the next entry of each array in ``rows``. Return all states
+        along a first axis."""
         states = [state]
         for k in range(count):
             states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
@@ -76,7 +75,7 @@ class Bridge(ABC):
 def bound(
     function: Callable[Concatenate[Bridge, Arguments], Result], bridge: Bridge, module: str
 ) -> Callable[Arguments, Result]:
-    """Return a function of this module with a given ``bridge``, as a public function of another ``module``."""
+    """Bind a function of this module to a ``bridge``, and return it as a public function of ``module``."""
 
     def call(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         return function(bridge, *arguments, **named)
@@ -103,13 +102,15 @@ def steps_layer(simulation: Simulation, steps: int, gradient: AdjointEstimator |
 def state(
     bridge: Bridge, simulation: Simulation, given: Given | DeviceState = None, parameters: Values | None = None
 ) -> dict[str, Any]:
-    """Return a state of a ``simulation`` as arrays: the first state, or a ``given`` one, such as
+    """Return a state of a ``simulation`` as arrays: the initial state, or a ``given`` state, such as
     ``trajectory.last_state``.
 
-    ``parameters``: numbers on which the first state depends, such as ``initial_velocities``, or those of the given
-    state's run. Return positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases), reference_density (n,),
-    time () [s], and further fields of the solver; in a batch with a first axis for the scenes. Raise `InputError` for
-    unsuitable arguments.
+    ``parameters`` are values that affect the initial state, such as ``initial_velocities``. For a given state they are
+    the parameters of its run.
+
+    The result has positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases), reference_density (n,), time
+    () [s], and further fields of the solver. In a batch the first axis is the scene. Raises `InputError` for unsuitable
+    arguments.
 
     Example: ``first = state(simulation)  # first["positions"]: (n, d)``
     """
@@ -124,7 +125,8 @@ def restart_state(
 ) -> RestartState | tuple[RestartState, ...]:
     """Convert a state of arrays to restart states for `Simulation.run`, files and other processes.
 
-    ``given``: a state of ``simulation``; ``parameters``: those of the run so far, if the state depends on them.
+    ``given`` is a state of ``simulation``. ``parameters`` are the parameters of the run so far, if they affect the
+    state.
 
     Example: ``run = simulation.run(100, state=restart_state(simulation, end))``
     """
@@ -147,14 +149,21 @@ def step(
     steps: int = 1,
     gradient: AdjointEstimator | None = None,
 ) -> dict[str, Any]:
-    """Return the state after ``steps`` steps from ``given``: `Simulation.step` as a function of arrays.
+    """Return the state ``steps`` steps after the state ``given``, as a function of arrays. It corresponds to
+    `Simulation.step`.
 
-    ``simulation``: takes the steps. ``parameters``: numbers or arrays for any parameters of `Problem` except initial
-    values; parameters over time have a row for each of these steps. Reverse mode uses the estimator ``gradient``, such
-    as `gradients.AdjointViscosity`, by default the exact adjoint; forward mode is exact. Exact derivatives of chained
-    steps are useful up to the horizon that `cortado gradients check` finds, some hundred steps. A chain warns if
-    adjoints grow by more than ten e-folds. Raise `InputError` for unsuitable arguments, and `DivergedError` if a
-    particle is lost.
+    Args:
+        simulation: takes the steps.
+        given: the state before the steps.
+        parameters: values for any parameters of `Problem` except initial values. Parameters over time have an entry for
+            each step.
+        steps: number of steps.
+        gradient: estimator for reverse mode, such as `gradients.AdjointViscosity`. The default is the exact adjoint.
+            Forward mode is always exact.
+
+    Exact derivatives of chained steps are useful up to the horizon that `cortado gradients check` finds, some hundred
+    steps. A warning is given if adjoints grow by more than ten e-folds over a chain. Raises `InputError` for unsuitable
+    arguments, and `DivergedError` if a particle is lost.
 
     Example: ``end = step(simulation, state(simulation), {"viscosity": 0.1}, steps=5)``
     """
@@ -170,10 +179,10 @@ def rollout(
     record_every: int = 1,
     gradient: AdjointEstimator | None = None,
 ) -> dict[str, Any]:
-    """Take ``steps`` steps and return the first state and the state after every ``record_every`` steps, along a first
-    axis (frames, ...); see `step`.
+    """Take ``steps`` steps and return the initial state and the state after every ``record_every`` steps, along a first
+    axis (frames, ...).
 
-    ``simulation``, ``given``, ``parameters`` and ``gradient`` are those of `step`.
+    ``simulation``, ``given``, ``parameters`` and ``gradient`` are the same as in `step`.
 
     Example: ``states = rollout(simulation, state(simulation), steps=20, record_every=5)  # ["positions"]: (5, n, d)``
     """
@@ -202,11 +211,11 @@ def rollout(
 
 
 def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., Any]:
-    """Return the loss of a ``problem`` as a function ``loss(parameters, state=None)`` of arrays by name, with results
-    (), or (batch,) for a batch.
+    """Return the loss of a ``problem`` as a function ``loss(parameters, state=None)`` of arrays by name. Its result has
+    the shape (), or (batch,) for a batch.
 
-    The problem begins at ``state``, if given. Reverse mode uses the estimator ``gradient``, by default
-    `gradients.Exact`, with the same bits as `Problem.value_and_gradient`.
+    If ``state`` is given, the run begins with this state. Reverse mode uses the estimator ``gradient``, by default
+    `gradients.Exact`, and gives the same bits as `Problem.value_and_gradient`.
 
     Example::
 
@@ -216,19 +225,18 @@ def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None =
     layer = Value(problem, gradient)
 
     def loss(parameters: Table, given: Table | None = None) -> Any:
-        """Return the loss for parameters, and optionally for a first state."""
         return _applied(bridge, layer, given, parameters)[LOSS]
 
     return loss
 
 
 def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[..., Any]:
-    """Return a function ``reading(state, parameters=None)`` of arrays that reads ``what``: a sensor, such as one of
+    """Return a function ``reading(state, parameters=None)`` of arrays. It reads ``what``: a sensor of
     `cortado.sensors`, or a quantity of the particles, such as "pressure".
 
-    A reading is an array (k,) with a number for each column of the sensor, or the quantity (n,) or (n, d).
-    ``parameters``: those of the step after the state, in which the pressure is computed. Raise `InputError` for a
-    ``simulation`` that is a batch.
+    The reading of a sensor is an array (k,) with one number for each column. The reading of a quantity is (n,) or (n,
+    d). ``parameters`` are the parameters of the step after the state, which determines the pressure. Raises
+    `InputError` if ``simulation`` is a batch.
 
     Example::
 
@@ -240,18 +248,23 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
     layer = Measure(simulation, what)
 
     def reading(given: Table, parameters: Table | None = None) -> Any:
-        """Return the reading of a state, with parameters of the next step."""
         return _applied(bridge, layer, given, parameters)[READING]
 
     return reading
 
 
 def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> Any:
-    """Return a picture (rows, columns, 3) of particles, linear RGB: `Renderer.render` as a function of arrays.
+    """Return a picture (rows, columns, 3) of particles in linear RGB, as a function of arrays. It corresponds to
+    `Renderer.render`.
 
-    ``renderer``: from `Simulation.renderer`; ``positions`` (n, d) [m]; ``fractions`` (n, phases), optional with one
-    phase; ``colours`` (phases, 3), by default the renderer's. Arrays pass through the host, and derivatives exist in
-    reverse mode only. Raise `InputError` for unsuitable arguments.
+    Args:
+        renderer: from `Simulation.renderer`.
+        positions: (n, d) [m].
+        fractions: mass fractions (n, phases), optional with one phase.
+        colours: (phases, 3), by default the colours of the renderer.
+
+    Arrays are copied to the host, and derivatives exist in reverse mode only. Raises `InputError` for unsuitable
+    arguments.
 
     Example: ``image = picture(simulation.renderer(resolution=(64, 48)), end["positions"])  # (48, 64, 3)``
     """
@@ -272,7 +285,7 @@ def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Tabl
 
 
 def table_of(what: str, given: Table | None) -> Table:
-    """Return a table, or an empty table for None; raise `InputError` for anything else."""
+    """Return a table, or an empty table for None. Raises `InputError` for any other value."""
     found = {} if given is None else given
     likely = {"parameters": "{'gravity': array}", "weights": "{'bias': array}"}.get(what, "{'positions': array, ...}")
     require_table(what, found, likely)
@@ -309,8 +322,8 @@ class Loop:
         return self.simulation.room(1, 2**30 if estimator else 0.0)
 
     def together(self, points: Sequence[Values], estimator: AdjointEstimator | None = None) -> list[Estimate]:
-        """Estimate losses and gradients of several loops in a mapped call; an estimate with an infinite loss contains
-        an error."""
+        """Estimate the losses and gradients of several loops in one mapped call. If a loss is infinite, the estimate
+        contains an error."""
         loops, gradient = LoopPass(self, points), dict[str, Any]()
         if estimator is not None:
             gradient = estimator.back(loops)
@@ -324,7 +337,8 @@ class Loop:
     def at(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None, slope: bool = False
     ) -> tuple[np.ndarray, Arrays]:
-        """Return the losses (k,) of k loops and, with ``slope``, gradients (k, ...) by name, in float64."""
+        """Return the losses of k loops (k,) in float64. If ``slope`` is true, also return their gradients (k, ...) by
+        name."""
 
         def loss(weights: Any, positions: Any) -> Any:
             return self._loss(weights, {**self._state, "positions": positions}, estimator)
@@ -354,7 +368,7 @@ class LoopPass:
         return self._losses
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Run the loops again, and return the gradients (k, ...) by name."""
+        """Run the loops a second time, and return the gradients (k, ...) by name."""
         self._losses, gradient = self._loop.at(self._points, estimator, slope=True)
         return gradient
 
@@ -369,13 +383,14 @@ class OneLoop(LoopPass):
 
 
 class Smoothed:
-    """A loss of a closed loop, smoothed by an estimator over an ensemble: see `smoothed`."""
+    """The loss of a closed loop, smoothed over an ensemble by an estimator. See `smoothed`."""
 
     def __init__(self, bridge: Bridge, estimator: GradientEstimator, loop: Loop):
         self._bridge, self._estimator, self._loop = bridge, estimator, loop
 
     def __call__(self, weights: Mapping[str, Any]) -> Any:
-        """Return the mean of the loss over the ensemble, whose reverse mode returns the gradient of `estimate`."""
+        """Return the mean of the loss over the ensemble. In reverse mode its derivative is the gradient of
+        `estimate`."""
 
         def found(given: Mapping[str, Any]) -> tuple[float, Arrays]:
             own = self.estimate(given)
@@ -386,7 +401,7 @@ class Smoothed:
     def estimate(self, weights: Mapping[str, Any]) -> Estimate:
         """Return the loss at the weights, and the smoothed gradient with its standard error, as NumPy arrays by name.
 
-        Raise `InputError` for weights that are no numbers, and for a weight with the reserved name "initial_positions".
+        Raises `InputError` if weights are not numbers, or if a weight has the reserved name "initial_positions".
         """
         given = table_of("weights", weights)
         own = {name: self._bridge.numbers(f"weight {name}", array) for name, array in given.items()}
@@ -402,15 +417,23 @@ def smoothed(
     estimator: GradientEstimator,
     state: Mapping[str, Any] | None = None,
 ) -> Smoothed:
-    """Return the ``loss`` of a closed loop, smoothed over an ensemble, as a function of ``weights``, arrays by name.
+    """Return the ``loss`` of a closed loop, smoothed over an ensemble, as a function of ``weights``, which are arrays
+    by name.
 
-    The function's value is the mean of the loss over the ensemble; the derivative is the smoothed gradient. The
-    function's method ``estimate(weights)`` returns an `Estimate` of both, with the standard error. A user writes
-    ``loss(weights, state, gradient)``, which returns a number, and passes ``gradient`` on to `step` or `rollout` of the
-    ``simulation``. The ``estimator`` sets the spread of the weights, in their units, and of first positions:
-    `gradients.EnsembleMean` averages gradients, and `gradients.Guided` corrects their size by differences of the loss.
-    Loops run in batches by `jax.vmap`, compiled, or by `torch.vmap`, from ``state`` on, by default the scene's first
-    state. Raise `InputError` for unsuitable arguments, and in a compiled program.
+    The value of the function is the mean of the loss over the ensemble, and its derivative is the smoothed gradient.
+    Its method ``estimate(weights)`` returns both as an `Estimate`, with the standard error.
+
+    Args:
+        simulation: simulation in which the loop runs.
+        loss: user-defined function ``loss(weights, state, gradient)``, which returns a number. It passes ``gradient``
+            on to `step` or `rollout`.
+        estimator: sets the spread of the weights, in their units, and the spread of initial positions.
+            `gradients.EnsembleMean` averages gradients, and `gradients.Guided` also corrects their size by differences
+            of the loss.
+        state: initial state of the loops, by default the initial state of the scene.
+
+    Loops run in batches by `jax.vmap`, compiled, or by `torch.vmap`. Raises `InputError` for unsuitable arguments, and
+    if called in a compiled program.
 
     Example::
 

@@ -1,11 +1,12 @@
-"""Layers as functions of JAX arrays: primitives with rules for both modes, for `jax.vmap` and for compiled programs.
+"""Layers as functions of JAX arrays: primitives with derivatives in forward and reverse mode, for `jax.vmap` and for
+compiled programs.
 
-A layer is a primitive. The primitive's forward-mode rule evaluates the layer, and calls a second primitive, the
-tangent, which is linear in tangents. The tangent's transpose is a third primitive, the adjoint. `jax.jvp` and
-`jax.grad` therefore use the same rules.
+Each layer is a JAX primitive. Its forward-mode rule evaluates the layer and calls a second primitive for the
+Jacobian-vector product. The transpose of the second primitive is a third primitive for the vector-Jacobian product.
+`jax.jvp` and `jax.grad` therefore use the same rules.
 
-JAX programs contain only arrays: residuals are stored in `RESIDUALS`, and an array, the ticket, contains a residual's
-number. Compiled programs call Python by Warp's foreign functions.
+JAX programs contain only arrays. Residuals are therefore stored in `RESIDUALS`, and an array called the ticket contains
+the number of a residual. Compiled programs call Python by Warp's foreign functions.
 """
 
 import inspect
@@ -42,12 +43,10 @@ except ModuleNotFoundError as error:
 SECOND = "A second derivative is asked for, but there are first ones only: differentiate once."
 MOST_KEPT = 2**30
 TICKET = 2
-"""Number of integers in a ticket: the residual's number, and the entry's number if the layer is mapped."""
+"""Number of integers in a ticket."""
 Kept = tuple[Layer, int | None, Any]
-"""A layer, the number of mapped entries (None if not mapped), and a residual."""
 Names = tuple[str, ...]
 Sizes = tuple[int, ...]
-"""Lengths of the axes over which a layer is mapped."""
 Arrays = Sequence[Any]
 Way = Literal["push", "pull"]
 
@@ -77,8 +76,8 @@ RESIDUALS = Residuals()
 
 
 def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
-    """Return a layer's results, mapped over ``entries`` along a first axis, and tickets (entries, 2) or (2,) of the
-    residual, which is stored if ``keep`` is true."""
+    """Return the results of a layer, mapped over ``entries`` along a first axis. If ``keep`` is true, the residual is
+    stored, and the returned tickets (entries, 2) or (2,) identify it."""
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
     number = RESIDUALS.put((own, entries, residual)) if keep else 0
@@ -89,11 +88,8 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
 def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
-    """Push tangents ``others`` of the arrays ``given`` forward through a layer, or pull adjoints ``others`` of the
-    results back. The tickets name the residual.
-
-    If JAX mapped the derivative over more ``entries`` than the layer, several derivatives, such as directions, belong
-    to an entry of the layer."""
+    """Compute a Jacobian-vector product or a vector-Jacobian product of a layer at the arrays ``given``. ``others`` are
+    tangents of these arrays or adjoints of the results. ``tickets`` identify the residual."""
     numbers, places = tickets.reshape(-1, TICKET).T
     last = way == "pull"
     kept = RESIDUALS.get(int(numbers[0]), last) if (numbers == numbers[0]).all() else None
@@ -139,7 +135,7 @@ def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: An
 
 
 def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[..., list[Any]]) -> Any:
-    """Make a JAX primitive from a function of arrays, whose mapped axes are merged into one."""
+    """Make a JAX primitive from a function of arrays."""
     made = Primitive(f"cortado_{name}")
     made.multiple_results = True
     made.def_abstract_eval(results)
@@ -248,7 +244,7 @@ class JaxBridge(Bridge):
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Apply a step repeatedly, in a compiled program as a loop."""
+        """Apply a step repeatedly. In a compiled program the repetition is a loop."""
         if not any(isinstance(array, jax.core.Tracer) for array in jax.tree.leaves((state, rows))):
             return super().repeated(step, state, rows, count)
 
@@ -263,7 +259,8 @@ class JaxBridge(Bridge):
         return jax.jit(jax.vmap(jax.value_and_grad(loss) if slope else lambda *given: (loss(*given), {})))
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return a value with a given gradient by a custom JAX rule, outside compiled programs."""
+        """Return a value and attach a given gradient to it by a custom JAX rule. This works only outside compiled
+        programs."""
 
         def forward(given: Any) -> tuple[Any, Any]:
             if any(isinstance(array, jax.core.Tracer) for array in given.values()):
@@ -291,8 +288,7 @@ def _jax_array(found: Array, wanted: Any) -> Any:
 
 
 class ForeignFunction:
-    """A Python function of arrays for compiled programs, which outlives the program because JAX may release a running
-    program."""
+    """A Python function of arrays for compiled programs."""
 
     def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
         self._number = next(_NUMBERS)
@@ -301,8 +297,6 @@ class ForeignFunction:
 
     @WARP
     def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        """Call the function in a traced function. ``shapes``: shapes of its results; ``results``: shapes and types for
-        JAX."""
         given = [array.reshape(array.shape or (1,)) for array in arrays]
         dims = {f"out_{k}": shape or (1,) for k, shape in enumerate(shapes)}
         kinds = tuple((array.ndim, str(array.dtype)) for array in given)
@@ -324,8 +318,6 @@ def _let_go(number: int) -> None:
 
 @cache
 def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], ...]) -> Any:
-    """Make the JAX function that calls a function by number, with arrays of given numbers of axes and types."""
-
     def call(*arguments: Any) -> None:
         arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
         with WARP, _in_order(results[0].device):
@@ -354,14 +346,12 @@ def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], .
 
 
 def _print(*words: Any, **options: Any) -> None:
-    """Replace Warp's printing of tracebacks in foreign functions, which has no setting: do not print Cortado's errors,
-    because JAX raises them."""
     if not isinstance(sys.exc_info()[1], CortadoError):
         print(*words, **options)
 
 
 def _in_order(device: Any) -> AbstractContextManager[Any]:
-    """Return a context with a separate GPU stream, after earlier and before later work of the program's stream."""
+    """Return a context with a separate GPU stream that is synchronised with the program's stream at both ends."""
     return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
 
 

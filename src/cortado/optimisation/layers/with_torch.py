@@ -28,14 +28,13 @@ Tensors = tuple[Any, ...]
 
 @dataclass(eq=False)
 class Call:
-    """An application of a layer to tensors with ``names``, and the residual for derivatives."""
+    """The application of a layer to tensors."""
 
     layer: Layer
     names: tuple[str, ...]
     keep: bool
     residual: Any = None
     many: "Call | None" = field(default=None, repr=False)
-    """The application to a batch of tensors by `torch.vmap`."""
 
     def evaluate(self, tensors: Tensors, keep: bool) -> Tensors:
         with _in_order(_device(self.layer)):
@@ -48,7 +47,7 @@ class Call:
         return self.residual
 
     def pull(self, tensors: Tensors, bars: Tensors) -> Tensors:
-        """Return the adjoints of all tensors, on the tensors' devices (reverse mode)."""
+        """Return the adjoints of all tensors by a vector-Jacobian product."""
         with _in_order(_device(self.layer)):
             found = self.layer.pull(self.kept(tensors), _arrays(self.layer.outputs(), bars))
             each = zip(self.names, tensors, strict=True)
@@ -95,8 +94,7 @@ class Evaluate(torch.autograd.Function):
 
 
 class _Linear(torch.autograd.Function):
-    """A derivative of a layer as a PyTorch function of the layer's tensors, followed by adjoints or tangents, without
-    second derivatives."""
+    """A derivative of a layer as a PyTorch function of the layer's tensors and of adjoints or tangents."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Tensors, output: Tensors) -> None:
@@ -112,8 +110,7 @@ class _Linear(torch.autograd.Function):
 
 
 def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
-    """Make the `vmap` rule of a layer's derivative: a derivative of the mapped layer if the layer's inputs are mapped,
-    else a derivative of the layer for each entry."""
+    """Make the `vmap` rule of a layer's derivative."""
 
     def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
         size, count = info.batch_size, len(call.names)
@@ -181,7 +178,7 @@ class TorchBridge(Bridge):
         return lambda *given: mapped(*given)[::-1]
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return a value with a given gradient: add terms that are 0 and have this gradient."""
+        """Return a value and attach a given gradient to it."""
         value, gradient = found(weights)
         own = {name: array for name, array in weights.items() if isinstance(array, torch.Tensor)}
         moved = (((array - array.detach()) * array.new_tensor(gradient[name])).sum() for name, array in own.items())
@@ -202,7 +199,6 @@ def _device(layer: Layer) -> Any:
 
 @contextmanager
 def _in_order(device: Any) -> Iterator[None]:
-    """Run launches on a GPU after PyTorch's earlier work, and before PyTorch's later work."""
     if device.type != "cuda":
         yield
         return
@@ -223,14 +219,13 @@ def _array(tensor: Any) -> Array:
 
 
 def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> Tensors:
-    """Return a layer's results as tensors, on the host unless `Layer.on_device` has their name."""
     real, device = _dtype(layer), _device(layer)
     each = ((found[name], shape, device if name in layer.on_device else "cpu") for name, shape in shapes.items())
     return tuple(_tensor(array, shape, real, place) for array, shape, place in each)
 
 
 def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
-    """Return an array as a tensor in the same memory, or as a copy if type or device differ."""
+    """Convert an array to a tensor. The tensor shares the memory of the array if type and device allow it."""
     own = wp.to_torch(array) if isinstance(array, wp.array) else torch.from_numpy(np.array(array))
     assert own.numel() == prod(shape)
     return own.to(dtype=dtype, device=device).reshape(tuple(shape))

@@ -1,1 +1,1 @@
-"""Pictures of fluid in space: the surface around its particles, and a ray tracer for it, both on a device."""
+"""Pictures of fluid in 3-D: the surface of the fluid, and a ray tracer."""

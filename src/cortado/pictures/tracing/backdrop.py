@@ -1,6 +1,6 @@
 """The surroundings of the fluid as Warp functions: lit surfaces, sky with lamps, floor, and glass container.
 
-Coordinates are in picture axes, with y upwards; colours are linear.
+Coordinates are in picture axes with y upwards, and colours are linear.
 """
 
 from typing import Any
@@ -15,24 +15,24 @@ from cortado.pictures.tracing.near_particles import Floats, Ints, Vec2s, Vec3s, 
 class LitSurface:
     mesh: wp.uint64
     corners: Ints
-    """(3 triangles,) indices of points"""
+    """Indices of the points of all triangles (3 triangles,)."""
     normals: Vec3s
-    """(points,) outwards"""
+    """Outward unit vectors (points,)."""
     colours: Vec3s
-    """(points,)"""
     light: Vec3s
-    """(points,) light that falls on the surface, in units in which a white surface reflects 1"""
+    """Light that falls on the surface (points,). A white surface in the light 1 has the brightness 1."""
     media: Vec2s
-    """(points,) scattering and absorption [1/m]"""
+    """Scattering and absorption (points,) [1/m]."""
     is_flat: wp.int32
     reach: wp.float32
-    """Greatest distance [m] that triangles of fluid extend behind a wall."""
+    """Greatest extent of triangles of fluid behind a wall [m]."""
     left: Vec2s
-    """(triangles,) of transparent solids: fraction of light transmitted, seen from inside and from outside"""
+    """Transmitted fraction of light for each triangle of a transparent solid, from inside and from outside
+    (triangles,)."""
     reflectivity: Floats
-    """(triangles,) of opaque solids: fraction of light that they reflect like a mirror of their colour"""
+    """Mirror reflectivity of each triangle of an opaque solid (triangles,)."""
     from_edges: wp.array(dtype=wp.mat33)
-    """(triangles,) of transparent solids: distances [m] of corners (columns) from up to three sharp edges (rows)"""
+    """Distances of the corners (columns) of a triangle from up to three sharp edges (rows) [m]."""
 
 
 @wp.func
@@ -46,7 +46,7 @@ def at_corners(surface: LitSurface, values: wp.array(dtype=Any), face: wp.int32,
 
 @wp.func
 def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
-    """Turn an interpolated normal to the side of the triangle that the ray comes from."""
+    """Turn an interpolated normal against the direction of a ray."""
     outside = face_normal
     n = normal
     if wp.dot(outside, d) > 0.0:
@@ -64,7 +64,7 @@ class SurfaceHit:
     is_solid: wp.bool
     t: wp.float32
     normal: wp.vec3
-    """On the side that the ray comes from."""
+    """Normal that points against the ray."""
     colour: wp.vec3
     light: wp.vec3
     reflectivity: wp.float32
@@ -98,7 +98,7 @@ FAR = wp.constant(wp.float32(1.0e9))
 
 
 def shading_module(has_opaque: bool, has_clear: bool) -> Any:
-    """Return the Warp module of kernels for scenes with opaque or transparent solids, or with none."""
+    """Return the Warp module of the shading kernels for a kind of scene."""
     return kernel_module("shading" + "_opaque" * has_opaque + "_clear" * has_clear)
 
 
@@ -107,22 +107,22 @@ class Solids:
     opaque: wp.uint64
     are_cut: wp.int32
     clear: wp.uint64
-    """The mesh of transparent solids and of tanks; all space outside a tank's cavity counts as inside the tank."""
+    """Mesh of transparent solids and of tanks."""
     has_tank: wp.int32
     surfaces: wp.array(dtype=LitSurface)
-    """(2,) of opaque and of clear solids, in an array because functions get a copy of their arguments"""
+    """Surfaces of opaque and of transparent solids (2,)."""
 
 
 @wp.struct
 class Environment:
     size: wp.float32
-    """Size of the contents [m], which scales floor, grid and rims."""
+    """Size of the contents [m]."""
     nearest: wp.float32
-    """Distance [m] between a ray's start and the surface from which it starts."""
+    """Least distance of a hit from the start of a ray [m]."""
     segments: wp.int32
     sun: wp.vec3
     fill: wp.vec3
-    """Unit vector towards a second, weak lamp, which is only visible in reflections."""
+    """Unit vector towards a second, weak lamp."""
     lamp: wp.vec3
     strip: wp.vec3
     sunlight: wp.vec3
@@ -131,30 +131,29 @@ class Environment:
     has_floor: wp.int32
     floor_colour: wp.vec3
     floor_height: wp.float32
-    """[m]"""
     floor_centre: wp.vec3
-    """[m]"""
     grid: wp.float32
-    """Distance between the lines on the floor [m]; 0 without lines."""
+    """Distance between the lines on the floor [m], or 0 without lines."""
     shadow_corner: wp.vec3
     shadow_cell: wp.float32
     glass: wp.int32
     glass_frame: wp.mat33
-    """Rotation from picture axes to container axes; a cylinder's axis is the second."""
+    """Rotation from picture axes to container axes. The axis of a cylinder is the second container axis."""
     glass_lower: wp.vec3
-    """[m], container axes"""
+    """Lower corner of the container in container axes [m]."""
     glass_upper: wp.vec3
-    """[m]"""
+    """Upper corner of the container in container axes [m]."""
     has_room: wp.int32
     room_lower: wp.vec3
-    """Lower ends of the shown region in container axes [m]; -FAR along axes without an end."""
+    """Lower corner of the shown region in container axes [m], -FAR if the region is infinite."""
     room_upper: wp.vec3
-    """[m]"""
+    """Upper corner of the shown region in container axes [m]."""
     panes: wp.mat33
-    """1 where the container has a pane, 0 where it is open: rows for lower and upper ends, columns for axes."""
+    """Mask of the sides of the container that are panes of glass. Rows are lower and upper ends, and columns
+    are axes."""
     edge_colour: wp.vec3
     has_walls: wp.int32
-    """True for an opaque container: walls are invisible from outside and visible from inside."""
+    """True for an opaque container."""
     wall_colour: wp.vec3
     wall_reflectivity: wp.float32
     solids: Solids
@@ -168,7 +167,7 @@ def smooth_step(lower: wp.float32, upper: wp.float32, x: wp.float32):
 
 @wp.func
 def schlick(normal_reflectance: wp.float32, cosine: wp.float32):
-    """Return Fresnel's reflectance in Schlick's approximation (1994)."""
+    """Return Fresnel's reflectance by Schlick's approximation (1994)."""
     m = wp.clamp(1.0 - cosine, 0.0, 1.0)
     m2 = m * m
     return normal_reflectance + (1.0 - normal_reflectance) * m2 * m2 * m
@@ -181,7 +180,7 @@ def mirrored(direction: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def sky(s: Environment, d: wp.vec3):
-    """Return the light from a direction above the floor: a gradient, a soft lamp, and a strip of light opposite."""
+    """Return the light of the sky and its lamps from a direction."""
     base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
     strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
@@ -195,8 +194,7 @@ def open_light(s: Environment, normal: wp.vec3):
 
 @wp.func
 def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
-    """Return the fraction of light that reaches a point of the floor, interpolated between nodes; 1 outside the
-    nodes."""
+    """Return the fraction of light that reaches a point of the floor."""
     u = (x - s.shadow_corner[0]) / s.shadow_cell
     v = (z - s.shadow_corner[2]) / s.shadow_cell
     i = wp.int32(wp.floor(u))
@@ -212,14 +210,14 @@ def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
 
 @wp.func
 def line(x: wp.float32, grid: wp.float32, width: wp.float32):
-    """Return 1 on the lines of a grid, 0 between them; lines thinner than a pixel fade."""
+    """Return 1 on the lines of a grid and 0 between them. Lines thinner than a pixel fade."""
     off = wp.abs(x / grid - wp.round(x / grid)) * grid
     return 1.0 - smooth_step(0.35 * width, width, off)
 
 
 @wp.func
 def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
-    """Return the floor's colour at p, fading to the horizon; ``footprint`` is the width of a pixel there [m]."""
+    """Return the colour of the floor at a point p. ``footprint`` is the width of a pixel at p [m]."""
     colour = s.floor_colour
     if s.grid > 0.0:
         thin = 0.0035 * s.size
@@ -233,7 +231,8 @@ def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
 
 @wp.func
 def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-    """Return the light of a ray that meets neither fluid nor glass; ``spread`` is the width of a pixel at 1 m [m]."""
+    """Return the light of a ray that meets neither fluid nor glass. ``spread`` is the width of a pixel at a distance of
+    1 m [m]."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]
         if t > 0.0:
@@ -244,7 +243,8 @@ def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spr
 
 @wp.func
 def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """Return the part of a ray's span between two planes across an axis; o and d are components along that axis."""
+    """Return the part of a ray between two planes perpendicular to an axis. ``o`` and ``d`` are the components of the
+    ray's origin and direction along this axis."""
     if wp.abs(d) > 1.0e-9:
         t1 = (lower - o) / d
         t2 = (upper - o) / d
@@ -256,8 +256,8 @@ def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, 
 
 @wp.func
 def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray inside the upright cylinder, open at its ends, inscribed in a box; from FAR to -FAR if
-    the ray misses it."""
+    """Return the part of a ray inside the upright cylinder in a box. If the ray misses the cylinder, the result is from
+    FAR to -FAR."""
     radius = 0.5 * (upper[0] - lower[0])
     x = o[0] - 0.5 * (lower[0] + upper[0])
     z = o[2] - 0.5 * (lower[2] + upper[2])
@@ -275,7 +275,8 @@ def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray inside the container's walls; from FAR to -FAR if the ray misses the container."""
+    """Return the part of a ray inside the container. If the ray misses the container, the result is from FAR
+    to -FAR."""
     p = s.glass_frame * o
     q = s.glass_frame * d
     span = wp.vec2(-FAR, FAR)
@@ -291,7 +292,8 @@ def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the span of a ray in which fluid is shown; from FAR to -FAR without a span."""
+    """Return the part of a ray inside the shown region. If the ray misses the region, the result is from FAR
+    to -FAR."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
     return within_walls(s, o, d)
@@ -299,7 +301,7 @@ def room(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def wall_normal(s: Environment, p: wp.vec3):
-    """Return the outward normal of the wall that a point is on."""
+    """Return the outward normal of the wall at a point."""
     q = s.glass_frame * p
     n = wp.vec3(0.0)
     best = FAR
@@ -329,12 +331,12 @@ GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
 
 
 MILKY = wp.constant(wp.float32(0.07))
-"""Greatest fraction of light that a glass pane reflects, so that panes stay transparent at grazing angles."""
+"""Greatest reflectance of a pane of glass."""
 
 
 @wp.struct
 class Passed:
-    """The light that glass adds along a ray, and the fraction of light that it transmits."""
+    """Light from the glass along a ray, and the fraction of light that the glass transmits."""
 
     light: wp.vec3
     through: wp.float32
@@ -344,7 +346,7 @@ class Passed:
 def pane(
     s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
-    """Add a sheet of glass behind the sheets already passed; ``rim`` is the visibility of its coloured edge, from 0 to
+    """Add a sheet of glass behind the sheets in ``behind``. ``rim`` is the visibility of the coloured edge, from 0 to
     1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)

@@ -1,5 +1,4 @@
-"""Triangle surfaces of fluid: one surface around all particles, computed on the device, or a sphere around each
-particle."""
+"""Triangle surfaces of fluid: one surface around all particles, or a sphere around each particle."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -27,31 +26,31 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_of, smoothed, triangles_of
 
 NEIGHBOURS = 24
-"""Number of particles over which the colour of a surface point is averaged."""
+"""Number of particles in the mean colour of a surface point."""
 
 ROUND = 10_000
-"""Greatest number of spheres drawn with 128 triangles each; more spheres have 32."""
+"""Greatest number of spheres drawn with 128 triangles each. More spheres are drawn with 32 triangles each."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in 3-D; seen from outside, the corners of triangles run counterclockwise."""
+    """A triangle mesh in 3-D. Seen from outside, the corners of a triangle run counterclockwise."""
 
     points: Points
-    """(p, 3) [m]"""
+    """Points (p, 3) [m]."""
     triangles: np.ndarray
-    """(t, 3) numbers of points"""
+    """Indices of the points of each triangle (t, 3)."""
     normals: Points
-    """(p, 3) unit vectors outwards"""
+    """Outward unit vectors (p, 3)."""
     colours: Points
-    """(p, 3) linear"""
+    """Linear colours (p, 3)."""
     velocities: Points | None = None
-    """(p, 3) [m/s]; None if unknown and for a solid, whose poses give its motion."""
+    """Velocities (p, 3) [m/s], or None for solids and if velocities are unknown."""
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:
-    """Return colours (p, 3) at points (p, d) [m]: the mean over particles at positions (n, d) [m] with colours (n, 3),
-    of which the nearest count most."""
+    """Return mean colours (p, 3) at points (p, d) [m] of the nearest particles, which have ``positions`` (n, d) [m] and
+    ``colours`` (n, 3)."""
     from scipy.spatial import cKDTree
 
     distances, which = cKDTree(positions).query(points, k=min(NEIGHBOURS, len(positions)), workers=usable_cores())
@@ -61,8 +60,7 @@ def nearest_colours(points: Points, positions: Points, colours: Points, spacing:
 
 
 def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
-    """Make a sphere around each of the particles (n, 3) [m], in its colour (n, 3); spheres of adjacent particles
-    touch."""
+    """Make a sphere around each particle at ``positions`` (n, 3) [m], with its colour (n, 3)."""
     corners, triangles = _sphere(2 if len(positions) <= ROUND else 1)
     n, k = len(positions), len(corners)
     return Mesh(
@@ -75,7 +73,7 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
 
 @cache
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
-    """Make corners (k, 3) and triangles of a unit sphere: an octahedron with each triangle cut into four ``levels``
+    """Make the corners (k, 3) and triangles of a unit sphere from an octahedron whose triangles are cut ``levels``
     times."""
     octants = np.array([np.diag(signs) for signs in product((1.0, -1.0), repeat=3)])
     triangles = np.array([one if np.linalg.det(one) > 0.0 else one[[0, 2, 1]] for one in octants]) + 0.0  # no -0
@@ -89,43 +87,40 @@ def _sphere(levels: int) -> tuple[Points, np.ndarray]:
 
 
 REACH = 3.0
-"""Reach of the particles' bumps, in spacings."""
+"""Support radius of a particle in the density of the fluid [spacings]."""
 REACH_OF_COLOURS = 2.25
-"""Reach within which particles contribute to colours, in spacings."""
+"""Support radius of a particle in colours [spacings]."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
-"""Greatest number of particles for each width of cubes, in spacings."""
+"""Pairs of the greatest number of particles and the width of the lattice cubes [spacings]."""
 WeightedLook = wp.types.vector(6, wp.float32)
 MOST_CELLS = 1 << 26
-"""Greatest number of cells, one spacing wide, in which particles are searched."""
+"""Greatest number of cells in the search for particles."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
-"""Scattering and absorption [1/m] too small to be visible."""
+"""Least visible scattering and absorption [1/m]."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
-"""Sum of the bumps around a particle within a lattice. At the boundary the sum is less by exp(-1.93 a²), with the mean
-position of these particles a spacings aside."""
 DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
-"""Factors of the level of isolated particles, and of particles in a sheet or in a spray that fills half of space."""
+"""Factors of the volumes of isolated particles, and of particles in thin sheets."""
 FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
-"""Filled fractions of space: the factor goes from `DROP` at 0 to `SHEET` at the first, and to 1 between the second and
-third."""
+"""Filled fractions of space for isolated particles, thin sheets and bulk fluid."""
 FULL = wp.constant(wp.float32(2.84))
-"""Sum of the bumps of other particles near a particle above which the particle is not in a thin sheet."""
+"""Weighted number of neighbours above which a particle is not in a thin sheet."""
 
 
 @dataclass(frozen=True)
 class LiquidSurface:
     points: wp.array
-    """(p,) of vec3 [m]"""
+    """Points (p,) as vec3 [m]."""
     triangles: wp.array
-    """(3 t,) numbers of points"""
+    """Indices of the points of all triangles (3 t,)."""
     normals: wp.array
-    """(p,) of vec3, unit vectors outwards"""
+    """Outward unit vectors (p,) as vec3."""
     colours: wp.array
-    """(p,) of vec3, linear"""
+    """Linear colours (p,) as vec3."""
     media: wp.array
-    """(p,) of vec2, scattering and absorption [1/m]"""
+    """Scattering and absorption (p,) as vec2 [1/m]."""
     neighbours: wp.array
-    """(p,) adjacent points, as `smoothed` takes them"""
+    """Adjacent points of each point (p,), for `smoothed`."""
 
     def softened(self, light: wp.array, launch: BandLauncher) -> wp.array:
         everywhere = wp.ones(len(light), dtype=wp.float32, device=launch.device)
@@ -134,14 +129,12 @@ class LiquidSurface:
 
 @wp.func
 def crowd(s: NearParticles, j: wp.int32):
-    """Return the number of other particles near a particle times its volume, and the volume."""
     return s.volumes[j] * wp.vec2(1.0 / s.volumes[j] - 1.0, 1.0)
 
 
 @wp.func
 def tint(s: NearParticles, j: wp.int32):
-    """Return a particle's look for averages: colours, and logarithms of media, so that distant milk does not cloud
-    water."""
+    """Return the colours of a particle, and the logarithms of its scattering and absorption."""
     x = s.looks[j]
     return WeightedLook(x[0], x[1], x[2], wp.log(x[3] + CLEAREST), wp.log(x[4] + CLEAREST), 1.0)
 
@@ -151,7 +144,8 @@ crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_weights(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec3s, weights: Floats):
-    """Compute how much each corner is smoothed: little where few particles are (Löschner et al. 2023)."""
+    """Compute the smoothing weight of each point, which is small where there are few particles (Löschner et
+    al. 2023)."""
     v = first + wp.tid()
     near = crowd_near(s, points[v], reach)
     x = wp.min(near[0] / wp.max(near[1], 1.0e-9) / FULL, 1.0)
@@ -171,7 +165,6 @@ def find_looks(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec
 
 @wp.func
 def place(s: NearParticles, j: wp.int32):
-    """Return a particle's position and 1, whose sums give the mean position and the number of particles."""
     x = s.places[j] - s.lower
     return wp.vec4(x[0], x[1], x[2], 1.0)
 
@@ -181,8 +174,7 @@ place_near = sum_near(place, wp.vec4)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
-    """Write particles' volumes, reduced where the neighbourhood within ``reach`` is not filled, so that sheets are not
-    too thick."""
+    """Compute the volumes of particles. Particles in thin sheets get smaller volumes."""
     i = first + wp.tid()
     near = place_near(s, s.places[i], reach)
     off = (wp.vec3(near[0], near[1], near[2]) / near[3] - s.places[i] + s.lower) / s.spacing
@@ -193,11 +185,11 @@ def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Fl
 
 
 Level = tuple[Any, wp.array]
-"""`Blocks`, and the numbers of those that the surface may pass."""
+"""`Blocks`, and the numbers of the blocks that may contain the surface."""
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
-    """Return the level of the particles' fluid, with cubes at least ``least`` spacings wide, and its
+    """Return the density of the fluid on a lattice of cubes at least ``least`` spacings wide, and the
     `NearParticles`."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
@@ -213,8 +205,8 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, lea
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
-    """Make the surface of particles' fluid: a level of their density, smoothed by weights that preserve thin sheets
-    (Löschner et al. 2023). Raise `ComputationError` if there is none."""
+    """Make the surface of the fluid, which is a level set of its density. The smoothing preserves thin sheets (Löschner
+    et al. 2023). Raises `ComputationError` if there is no surface."""
     device, reach = launch.device, REACH * spacing
     if level is None:
         level, s = liquid_level(particles, spacing, launch, least)
@@ -234,7 +226,6 @@ def liquid_surface(
 
 
 def _shown(particles: Particles, spacing: float, launch: BandLauncher) -> tuple[Points, Points]:
-    """Return lower and upper corner of all particles, or of those around their median if some are very far away."""
     lower, upper = particles.ends(launch)
     if np.prod((upper - lower) / spacing + 1.0) <= MOST_CELLS:
         return lower, upper

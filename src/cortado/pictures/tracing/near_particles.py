@@ -1,4 +1,4 @@
-"""Particles on the device that draws them, selection of marked particles, and sums over the particles near a point."""
+"""Particles on the device of the ray tracer, and sums over the particles near a point."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,18 +26,17 @@ Vec3s2d, Vec4s2d = wp.array2d(dtype=wp.vec3), wp.array2d(dtype=wp.vec4)
 MODULE = kernel_module("liquid")
 MODULE.options["max_unroll"] = 2  # compiles in half the time
 Look = wp.types.vector(5, wp.float32)
-"""Red, green and blue, linear from 0 to 1, then scattering and absorption [1/m]."""
+"""Linear red, green and blue from 0 to 1, then scattering and absorption [1/m]."""
 Looks = wp.array(dtype=Look)
 OPAQUE = (1e6, 0.0)
-"""Scattering and absorption [1/m] of opaque fluid."""
+"""Scattering and absorption of opaque fluid [1/m]."""
 PARTS = 4096
-"""Number of parts into which particles are divided to find their ends."""
 AT_ONCE = 8000
-"""Number of particles whose values are mixed at a time; with more, BLAS starts threads and takes longer."""
+"""Number of particles in a block of a matrix product. In larger products BLAS starts threads and is slower."""
 
 
 def mixed(fractions: Points, values: Points) -> Points:
-    """Mix the values (phases, c) of phases to those (n, c) of particles by mass fractions (n, phases)."""
+    """Mix the values of phases (phases, c) by mass fractions (n, phases), and return values of particles (n, c)."""
     found, shares = np.empty((len(fractions), values.shape[1])), np.clip(fractions, 0.0, 1.0)
     for first in range(0, len(shares), AT_ONCE):
         np.matmul(shares[first : first + AT_ONCE], values, out=found[first : first + AT_ONCE])
@@ -47,13 +46,13 @@ def mixed(fractions: Points, values: Points) -> Points:
 @dataclass(frozen=True)
 class Particles:
     places: wp.array
-    """(n,) of vec3 [m]"""
+    """Positions (n,) as vec3 [m]."""
     looks: wp.array
-    """(n,) of `Look`"""
+    """Colours, scattering and absorption (n,) as `Look`."""
 
     @classmethod
     def on(cls, device: Any, places: Points, colours: Points, media: ArrayLike = OPAQUE) -> "Particles":
-        """Copy NumPy arrays (n, 3), with ``media`` (n, 2) or (2,): scattering and absorption [1/m]. Raise
+        """Copy NumPy arrays (n, 3) to a device. ``media`` (n, 2) or (2,) has scattering and absorption [1/m]. Raises
         `ComputationError` for positions that are not finite."""
         finite = np.isfinite(places)
         if not finite.all():
@@ -70,7 +69,7 @@ class Particles:
         return len(self.places)
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
-        """(3,) [m] each."""
+        """Return the lower and the upper corner of the particles (3,) [m]."""
         count, device = min(PARTS, len(self)), self.places.device
         lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
         launch(find_ends, count, places=self.places, lower=lower, upper=upper)
@@ -99,7 +98,7 @@ def list_marked(first: wp.int32, marks: Ints, counts: Ints, numbers: Ints):
 
 
 def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
-    """Return the numbers of the marks (n,) that are 1, and the cumulative sum (n,) of the marks."""
+    """Return the indices of all marks (n,) that are 1, and the cumulative sum of the marks (n,)."""
     counts = wp.empty_like(marks)
     wp.utils.array_scan(marks, counts)
     numbers = wp.empty(last_of(counts), dtype=wp.int32, device=marks.device)
@@ -114,23 +113,22 @@ def last_of(numbers: wp.array) -> int:
 @wp.struct
 class NearParticles:
     lower: wp.vec3
-    """[m]"""
+    """Lower corner of the cells [m]."""
     spacing: wp.float32
-    """[m], width of cells"""
+    """Width of cells [m]."""
     shape: wp.vec3i
     starts: Ints
-    """(cells + 1,) number of the first particle of each cell"""
+    """Index of the first particle of each cell (cells + 1,)."""
     places: Vec3s
-    """(n,) [m]"""
+    """Positions (n,) [m]."""
     looks: Looks
-    """(n,)"""
     volumes: Floats
-    """(n,), such that bumps times volumes add up to about 1 within fluid; an isolated particle has volume 1"""
+    """Volumes (n,), relative to an isolated particle."""
 
 
 @wp.func
 def bump(q: wp.float32):
-    """Return the cubic spline of q, 1 in the middle, 0 from q = 1 on."""
+    """Return the cubic spline of q, which is 1 at q = 0 and 0 from q = 1 on."""
     if q < 0.5:
         return 1.0 - 6.0 * q * q * (1.0 - q)
     r = 1.0 - q
@@ -143,8 +141,8 @@ def bump_at(q: float) -> float:
 
 @cache
 def sum_near(term: Callable[..., Any], number: Any) -> Any:
-    """Make the Warp function ``(s, p, reach)`` that sums ``term(s, j)``, of Warp type ``number``, over particles j
-    around p, each times the bump with this reach [m]."""
+    """Make the Warp function ``(s, p, reach)`` that sums ``term(s, j)`` over the particles j within ``reach`` [m] of a
+    point p, weighted by `bump`. ``number`` is the Warp type of the term."""
 
     @wp.func
     def summed(s: NearParticles, p: wp.vec3, reach: wp.float32):
@@ -196,7 +194,7 @@ def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: 
 def near_particles(
     given: Particles, ends: tuple[np.ndarray, np.ndarray], spacing: float, reach: float, launch: BandLauncher
 ) -> Any:
-    """Sort the particles between ``ends``, (3,) each [m], to `NearParticles`; bumps have a ``reach`` [m]."""
+    """Sort the particles between the corners ``ends`` (3,) [m] into cells, for sums within ``reach`` [m]."""
     device, lower = launch.device, np.floor(ends[0] / spacing) * spacing
     x, y, z = (int(n) + 1 for n in np.floor((ends[1] - lower) / spacing))
     sorting = CellSort(Grid(lower, np.full(3, spacing), (x, y, z)), len(given), FLOAT32, device)

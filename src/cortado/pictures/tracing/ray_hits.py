@@ -1,4 +1,4 @@
-"""Warp functions that compute hits of rays on solids, walls, panes of glass, and the surface of the fluid."""
+"""Warp functions that find the first hit of a ray on solids, walls, glass, and the surface of the fluid."""
 
 from functools import cache
 from typing import Any
@@ -32,15 +32,15 @@ from cortado.pictures.tracing.backdrop import (
 from cortado.pictures.tracing.near_particles import Vec3s2d
 
 LAYERS = 8
-"""Greatest number of surfaces of transparent solids that a ray passes."""
+"""Greatest number of transparent surfaces along a ray."""
 
 
 @wp.struct
 class SolidHit:
     t: wp.float32
-    """Distance along the ray; FAR if it hits no solid."""
+    """Distance along the ray, or FAR without a hit."""
     is_cut: wp.bool
-    """True for a hit on a container wall where the solid crosses it."""
+    """True for a hit on the cut of a solid by a container wall."""
     face: wp.int32
     u: wp.float32
     v: wp.float32
@@ -90,7 +90,7 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32):
-    """Return the light of a solid where a ray meets it; ``glossy`` is 0 for a hit inside fluid."""
+    """Return the light of a solid at a hit. ``glossy`` is 0 inside fluid."""
     r = mirrored(d, met.normal)
     seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
@@ -104,7 +104,7 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """Add the surfaces of transparent solids that a ray passes up to ``most`` [m], except surfaces on the floor."""
+    """Add the surfaces of transparent solids along a ray, up to the distance ``most`` [m]."""
     passed = before
     start = s.nearest
     for _ in range(LAYERS):
@@ -142,7 +142,7 @@ def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
 
 @wp.func
 def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before: Passed):
-    """Add the wall through which a ray leaves the container, if it is no further than ``most`` [m]."""
+    """Add the opaque container wall along a ray, up to the distance ``most`` [m]."""
     part = within_walls(s, o, d)
     t = part[1]
     if t <= wp.max(part[0], s.nearest) or t >= most:
@@ -160,7 +160,7 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 
 @wp.func
 def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
-    """Add the side of the box that a ray passes at the point q in container axes."""
+    """Add the glass side of a box at a point q in container axes."""
     axis = wp.int32(0)
     best = FAR
     side = wp.int32(0)
@@ -187,7 +187,7 @@ def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: 
 
 @wp.func
 def tube_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
-    """Add the side of the cylinder that a ray passes at the point q in container axes; the ends are open."""
+    """Add the glass side of a cylinder at a point q in container axes."""
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
         return before
     x = 0.5 * (s.glass_lower[0] + s.glass_upper[0])
@@ -224,7 +224,7 @@ def container_glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, sp
 def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
     @wp.func
     def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
-        """Return the glass that a ray passes up to the distance ``most`` [m]."""
+        """Return the glass along a ray, up to the distance ``most`` [m]."""
         passed = Passed()
         passed.light = wp.vec3(0.0)
         passed.through = 1.0
@@ -254,8 +254,7 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
 @wp.func
 def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Find where a ray hits, at a point p, the wall that fluid touches; triangles of the fluid extend behind the
-    wall."""
+    """Move the hit of a ray on the fluid's surface behind a wall to the wall."""
     near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
     if not near.result:  # deep within fluid that has just reached the wall
         near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
@@ -266,7 +265,6 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 
 @wp.func
 def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Find the hit of `at_wall` more quickly, by a near triangle of the surface behind the wall along ``normal``."""
     met = SurfaceHit()
     met.found = False
     hit = wp.mesh_query_ray(surface.mesh, p, normal, surface.reach)
@@ -304,7 +302,7 @@ def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part
 
 @wp.func
 def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Find where a ray enters the fluid among transparent solids, which contain no fluid."""
+    """Find the entry of a ray into the fluid in a scene with transparent solids."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR
@@ -346,7 +344,7 @@ def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: w
 def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
     @wp.func
     def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
-        """Find where a ray from outside enters the fluid, unless it meets an opaque solid before."""
+        """Find the entry of a ray into the fluid."""
         met = SurfaceHit()
         met.found = False
         met.t = FAR
@@ -363,7 +361,7 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
     @wp.func
     def leave(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, most: wp.float32):
-        """Find where a ray inside the fluid leaves the fluid or hits an opaque solid, within ``most`` [m]."""
+        """Find the end of a ray inside the fluid, up to the distance ``most`` [m]."""
         part = room(s, o, d)
         wall_at = wp.where(part[1] > 0.0, part[1], FAR)
         hit = wp.mesh_query_ray(surface.mesh, o, d, wp.min(wall_at, most))

@@ -1,5 +1,4 @@
-"""Surfaces of the solids of a stage on the device that traces rays, and the soft shadow of fluid and solids on the
-floor."""
+"""Surfaces of solids on the device of the ray tracer, and the soft shadow of fluid and solids on the floor."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,15 +19,15 @@ from cortado.pictures.tracing.liquid_surface import Mesh
 from cortado.pictures.tracing.near_particles import Floats, Looks, Particles, Vec3s, Vec3s2d, Vec4s2d
 
 NODES = 320
-"""Number of nodes along either side of the floor that may lie in shadow."""
+"""Number of shadow nodes on the floor along each axis."""
 ABOVE = 1e-3
-"""Height, relative to the size of the contents, up to which a side of a solid counts as lying on the floor."""
+"""Height of solid surfaces that count as lying on the floor, relative to the size of the contents."""
 REACH = 1.5
-"""Half the width of the floor that may lie in shadow, relative to the size of the contents."""
+"""Half the width of the floor with shadow nodes, relative to the size of the contents."""
 KEY, AROUND = 0.022, 0.05
-"""Softness of the shadows of the lamp and of the sky, relative to the size of the contents."""
+"""Softness of the lamp's shadow and of the sky's shadow, relative to the size of the contents."""
 CLOSE = 0.15
-"""Approximate height above which objects do not shade the floor from the sky, relative to the size of the contents."""
+"""Greatest height of objects that shade the floor from the sky, relative to the size of the contents."""
 SKY = 0.32
 
 
@@ -37,18 +36,17 @@ Soften = Callable[[wp.array], wp.array]
 
 @dataclass(frozen=True)
 class DeviceSurface:
-    """A triangle surface on a device, without light at first; its arrays exist as long as this object."""
+    """A triangle surface on a device."""
 
     mesh: wp.Mesh
     lit: Any
-    """`LitSurface`"""
     softened: Soften | None = None
 
     @classmethod
     def of(
         cls, points: wp.array, triangles: wp.array, normals: wp.array, colours: wp.array, softened: Soften | None = None
     ) -> "DeviceSurface":
-        """Take triangles (3 t,) and points (p,) of vec3 [m]."""
+        """Make a surface from device arrays of triangles (3 t,) and points (p,) [m]."""
         mesh, found = wp.Mesh(points, triangles), LitSurface()
         found.mesh, found.corners, found.normals, found.colours = mesh.id, triangles, normals, colours
         found.light, found.media = wp.zeros_like(points), wp.zeros(len(points), dtype=wp.vec2, device=points.device)
@@ -62,9 +60,9 @@ class DeviceSurface:
 
 
 FINE, FINE_OWN = 0.03, 0.05
-"""Width of the faces of round solids: relative to the contents and relative to the solid; the smaller width counts."""
+"""Greatest width of the faces of round solids, relative to the contents and relative to the solid."""
 LONGEST = 0.04
-"""Greatest side of the triangles at whose corners light is computed, relative to the size of the contents."""
+"""Greatest side of illuminated triangles, relative to the size of the contents."""
 
 
 Placed = tuple[ShownSolid, SolidMesh]
@@ -92,8 +90,8 @@ typed = TypesByName(
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def cast(places, looks, volumes, corner, cell, slope, fading, begin, thickness):
-    """Add the shadow of each part of an object to the nearest four floor nodes along a slope: colour times thickness,
-    and thickness, faded with height by ``fading`` [1/m]."""
+    """Add the shadow of each particle to the nearest four floor nodes. The shadow fades with height by ``fading``
+    [1/m]."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
@@ -128,7 +126,6 @@ def blur(first, across, weights, sharp, found):
 
 @wp.func
 def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.float32):
-    """Return the fraction of light absorbed by a thickness; light of the object's colour is absorbed less."""
     reached = 1.0 - wp.exp(-above[3] / (0.75 * layer))
     colour = wp.vec3(above[0], above[1], above[2])
     hue = colour / wp.max(wp.max(colour), 1.0e-6 * wp.max(above[3], 1.0e-12))
@@ -138,7 +135,7 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
-    """Darken the nodes from ``begin`` on by the shadows of lamp and sky, each with its ``strength``."""
+    """Darken floor nodes by the shadows of the lamp and of the sky."""
     n = first + wp.tid()
     i = n / key.shape[1]
     j = n % key.shape[1]
@@ -156,11 +153,11 @@ class FloorShadow:
         middle = 0.5 * (stage.lower + stage.upper)
         self._stage, self._launch, self._device = stage, launch, launch.device
         self.corner = np.array([middle[0], stage.lower[1], middle[2]]) - np.array([REACH, 0.0, REACH]) * stage.size
-        """(3,) position of the first node [m]"""
+        """Position of the first node (3,) [m]."""
         self.cell = 2.0 * REACH * stage.size / (NODES - 1)
-        """[m]"""
+        """Distance between nodes [m]."""
         self.light = wp.ones((NODES, NODES), dtype=wp.vec3, device=self._device)
-        """(nodes, nodes) fraction of light at the nodes along x and z"""
+        """Fraction of light at the nodes along x and z (nodes, nodes)."""
 
     def of_fluid(self, particles: Particles) -> None:
         stage = self._stage
@@ -180,8 +177,8 @@ class FloorShadow:
         self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.transparency, 0.0)
 
     def _add(self, parts: Particles, volumes: list[wp.array], least: float, opacity: float, tinted: float) -> None:
-        """Add the shadow of particles with volumes (n,) [m3] as lamp and sky see them, at least ``least`` [m] soft.
-        ``tinted`` is the additional transmission of light of the object's colour."""
+        """Add the shadow of particles with ``volumes`` (n,) [m3] for the lamp and for the sky. ``least`` is the least
+        softness [m]."""
         if not len(parts):
             return
         stage = self._stage
@@ -198,8 +195,7 @@ class FloorShadow:
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
     def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
-        """Return the first floor node that an object's shadow may reach, with a margin of ``around`` nodes, and the
-        number of nodes along each side."""
+        """Return the first floor node under the shadow of an object, and the number of nodes along each axis."""
         lower, upper = (end - self.corner for end in parts.ends(self._launch))
         shifts = np.outer((0.0, lower[1], upper[1]), slope)
         first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around
@@ -209,7 +205,7 @@ class FloorShadow:
         return first.tolist(), (rows, columns)
 
     def _thickness(self, parts: Particles, volumes: wp.array, bell: Points, shape: tuple[int, int], **at: Any) -> Any:
-        """Return thicknesses as vec4, which `cast` adds up at nodes of this shape, blurred by a bell."""
+        """Return the blurred thickness of particles above the floor nodes."""
         sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
         given = {"places": parts.places, "looks": parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **at, thickness=sharp)
@@ -223,15 +219,14 @@ class FloorShadow:
 
 
 def _bell(sigma: float) -> Points:
-    """Return the weights of a node and of those beside it, by a Gaussian that is ``sigma`` nodes wide."""
+    """Return Gaussian weights at nodes along an axis. The standard deviation is ``sigma`` nodes."""
     bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
     found: Points = bell / (2.0 * bell.sum() - 1.0)
     return found
 
 
 class SolidSurfaces:
-    """The surfaces of a stage's solids: triangles are computed once, and moved to the solids' poses for each
-    picture."""
+    """The triangle surfaces of the solids of a stage."""
 
     def __init__(self, stage: Stage, device: Any):
         self._stage, self._device = stage, device
@@ -239,7 +234,7 @@ class SolidSurfaces:
 
     @property
     def kinds(self) -> tuple[bool, bool]:
-        """Whether opaque and whether transparent solids exist."""
+        """True if opaque solids exist, and true if transparent solids exist."""
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
@@ -249,8 +244,8 @@ class SolidSurfaces:
                 shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
-        """Return `Solids` and their surfaces, which the caller must store and illuminate, for ``solids`` at their
-        present poses."""
+        """Return the struct `Solids` and the surfaces of ``solids`` at their present poses. Keep a reference to the
+        surfaces while the struct is used."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         for k, is_clear in enumerate((False, True)):
@@ -284,7 +279,7 @@ class SolidSurfaces:
 
 
 def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
-    """Make the mesh of a solid about its middle; the outside of a tank is within the cavity."""
+    """Make the mesh of a solid relative to its middle. For a tank it is the mesh of the cavity."""
     own = float(np.ptp(shown.shape.extent(), axis=0).max())
     faces = shown.shape.shown_faces(min(FINE * size, FINE_OWN * own))
     longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
@@ -296,6 +291,5 @@ def _is_clear(shown: ShownSolid) -> bool:
 
 
 def _left(shown: ShownSolid) -> tuple[float, float]:
-    """Return the fraction of light transmitted by one surface, seen from inside a solid and from outside; tanks can
-    always be seen into."""
+    """Return the transmitted fraction of light at a surface of a solid, from inside and from outside."""
     return (1.0, shown.transparency) if shown.is_tank else (shown.transparency**0.5,) * 2

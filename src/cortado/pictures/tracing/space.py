@@ -1,7 +1,6 @@
-"""Pictures of fluid in 3-D, by a ray tracer on the device of the run.
+"""Draws pictures of fluid in 3-D with a ray tracer.
 
-Particles that touch walls and solids get mirror images, so that the surface continues behind walls and solids and no
-gap is visible.
+Particles near walls and solids get mirror images behind the wall, so that the fluid is drawn without a gap.
 """
 
 from collections.abc import Sequence
@@ -51,21 +50,21 @@ from cortado.scene.appearance import View
 from cortado.scene.scene import Scene
 
 SKIN = 0.7
-"""Approximate distance in spacings to which fluid is drawn beyond a particle."""
+"""Approximate distance from a particle to the drawn surface [spacings]."""
 DEPTHS = (1.0, 0.7, 0.4, 0.1)
-"""Depths of mirror images behind a surface, relative to the particle's distance from it; the first one that a thin
-solid hides is used."""
+"""Depths of a mirror image behind a surface, relative to the particle's distance from the surface. The first depth with
+a hidden image is used."""
 ON_SURFACE = 0.05
-"""Distance in spacings below which a point counts as on a surface."""
+"""Tolerance for points on a surface [spacings]."""
 SAME_SIDE = 0.8
-"""Greatest cosine between the normals of two sides of a corner."""
+"""Cosine of the angle between two normals on the same side of a solid."""
 
 
 def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing: float) -> tuple[Points, np.ndarray]:
-    """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the point of each, (m,).
+    """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the index of the original point (m,).
 
-    A point closer to a solid than ``near`` [m] has an image behind each touched side, and behind the corner between
-    two touched sides. Images that a thin solid would not hide are closer to the surface or left out.
+    A point closer to a solid than ``near`` [m] has an image behind each touched side, and behind the corner between two
+    touched sides. Behind a thin solid the image is closer to the surface or left out.
     """
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
@@ -82,8 +81,6 @@ def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing:
 
 
 def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) -> list[Points]:
-    """Return for each touched side the vectors (n, d) [m] from points (n, d) [m] to their images behind this side, or
-    0."""
     solid, normals, ways = shown.solid, list[Points](), list[Points]()
     for probe in touching * np.concatenate([np.zeros((1, len(shown.turn))), shown.turn.T, -shown.turn.T]):
         feet, away = solid.nearest(points + probe), solid.outward(points + probe)
@@ -102,8 +99,7 @@ def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) ->
 
 
 TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = wp.constant(wp.float32(0.8)), 1.1, wp.constant(wp.float32(1.5))
-"""Distances in spacings below which fluid touches a flat wall, a solid and a round wall. A cubic lattice in a round cup
-ends up to one and a half spacings from the wall."""
+"""Distances between particles and a touched flat wall, a touched solid, and a touched round wall [spacings]."""
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -115,8 +111,8 @@ def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
 def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
-    """Return particles in picture axes, from positions (n, 3) [m] in the scene's axes, colours (n, 3) and mass
-    fractions (n, phases), by default even ones."""
+    """Return particles in picture axes. ``positions`` (n, 3) [m] are in the axes of the scene. ``fractions`` (n,
+    phases) are mass fractions, by default equal for all phases."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -126,8 +122,8 @@ def particles_of(
 
 @wp.func
 def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
-    """Return which mirror images a particle at q, in container axes, has along an axis: bit 1 for the lower wall, bit 2
-    for the upper. Along a cylinder's first axis, images are behind its round wall."""
+    """Return which mirror images a particle at ``q`` has along an axis: bit 1 for the lower wall, bit 2 for the upper
+    wall."""
     found = wp.int32(0)
     if s.glass == wp.static(GLASS_BOX) or axis == 1:
         if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
@@ -144,7 +140,7 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """Return the vector from a particle at q to an image of `images_along`, or to itself (image 0)."""
+    """Return the vector from a particle at ``q`` to its mirror image along an axis."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -182,7 +178,7 @@ def list_images(
     image_places: Vec3s,
     image_looks: wp.array(dtype=Look),
 ):
-    """List places and looks of all images; ``counts`` has the number of images up to each particle."""
+    """List the positions and colours of particles and of their mirror images."""
     i = first + wp.tid()
     n = wp.int32(0)
     if i > 0:
@@ -202,7 +198,7 @@ def list_images(
 
 
 def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> Particles:
-    """Return particles with their images behind solids and behind the walls of the container of an `Environment` s."""
+    """Return particles together with their mirror images behind solids and walls."""
     if stage.solids:
         placed = particles.places.numpy().astype(np.float64)
         images, of = mirrored(placed, stage.solids, TOUCHING_SOLID * stage.spacing, stage.spacing)
@@ -223,7 +219,7 @@ def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) ->
 
 
 def environment_of(stage: Stage) -> Any:
-    """Return the `Environment` of a stage, without solids and shadow."""
+    """Return the `Environment` of a stage without solids and shadows."""
     picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
     horizon = np.asarray(light.background)
     s.size, s.nearest, s.segments = stage.size, 1e-4 * stage.size, effort_of(stage.picture).segments
@@ -252,22 +248,21 @@ def environment_of(stage: Stage) -> Any:
 
 
 def _round_length(length: float) -> float:
-    """Return the greatest of 1, 2 and 5 times a power of ten that is not above a length."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
 
 
 class State(NamedTuple):
     positions: Points
-    """(n, d) [m], in the scene's axes"""
+    """Positions of particles (n, d) [m], in the scene's axes."""
     colours: Points
-    """(n, 3) linear"""
+    """Colours of particles (n, 3), in linear RGB."""
     pose: Scene | None = None
-    """The scene with its solids at the state's poses; None for poses that do not change."""
+    """Scene with the poses of the solids, or None if solids do not move."""
     view: View | None = None
-    """View of a moving camera; None for the home view."""
+    """View of a moving camera; None for a camera at rest."""
     fractions: Points | None = None
-    """(n, phases) mass fractions; None with one phase"""
+    """Mass fractions (n, phases); None for a single phase."""
 
 
 class SpacePainter:
@@ -279,7 +274,7 @@ class SpacePainter:
         self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
         shading = self._trace, self._illuminates
         self._kernels = *shading, find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
-        """One kernel of each module that a picture needs, so that the modules compile in parallel."""
+        """Kernels that a picture needs, for compiling their modules in parallel."""
         self._effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
         self._lamps = self._rays_to_light(*(self._effort.lights if is_liquid else SPHERE_LIGHTS))
         self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
@@ -293,7 +288,7 @@ class SpacePainter:
             return self._rays(*self.scenery(State(*state)))
 
     def still(self, state: State) -> Any:
-        """Return the `Still` of a state; None if the fluid is not drawn as a surface."""
+        """Return the `Still` of a state, or None if the fluid is not drawn as a surface."""
         with WARP:
             compile_ahead(self, self.device)
             stage, s, particles, shadow = self._placed(state)
@@ -305,14 +300,14 @@ class SpacePainter:
             return still_of(level, near, shadow.light, self._launch)
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
-        """Draw a state as a frame of a film in which fluid at rest does not move; see `steadied`."""
+        """Draw a state as a frame of a film without flickering. See `steadied`."""
         with WARP:
             steady = steadied(own, before, after, self.stage.spacing, self._launch)
             return self._rays(*self.scenery(state, steady))
 
     def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
-        """Return the stage of a state, its `Environment`, the fluid's surface and its shadow; ``steady`` is a `Still`
-        that replaces the state's level and shadow."""
+        """Return the stage of a state, its `Environment`, the fluid's surface and its shadow. ``steady`` is an optional
+        `Still` with an averaged surface and shadow."""
         stage, s, particles, shadow = self._placed(state)
         if steady is None:
             shadow.of_fluid(particles)
@@ -382,7 +377,6 @@ class SpacePainter:
 
 
 def _directions(count: int) -> Points:
-    """Return unit vectors (count, 3), evenly all around: the spiral of Fibonacci."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
     away = np.sqrt(1.0 - height**2)

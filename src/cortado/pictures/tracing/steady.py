@@ -1,9 +1,8 @@
-"""Keep fluid at rest from moving in films: its drawn surface is averaged over the frames in which it is at rest.
+"""Averages the drawn surface over frames of a film, so that fluid at rest does not flicker.
 
-Particles of water at rest drift and move its surface by fractions of a spacing. In each block of the lattice the mean
-level tells how far the fluid has moved in earlier and later frames. Consecutive frames with a displacement below a
-fraction of a spacing contribute to the drawn level. Where fluid moves further between frames, and in drops, no other
-frame contributes, and the level stays the same bit for bit.
+Particles of fluid at rest drift by fractions of a spacing, and the surface drifts with them. The lattice of the surface
+is divided into blocks. In each block, the change of the mean density measures how far the fluid moves between frames.
+Frames are averaged if the fluid moves less than a fraction of a spacing. Moving fluid and drops are drawn unchanged.
 """
 
 from collections.abc import Sequence
@@ -27,42 +26,40 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 
 WINDOW, SHADOW_WINDOW = 30, 6
-"""Number of frames before and after a frame that contribute to its level, and to its shadow, with falling weights."""
+"""Numbers of averaged frames before and after a frame, for the surface and for the shadow."""
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
-"""Limits of the displacement [spacings], the change of level and the change of light: up to the first limit a frame
-counts fully, from the second on it does not count."""
+"""Limits of the displacement [spacings], of the change of density and of the change of light. Below the first limit a
+frame has full weight, above the second limit the weight is 0."""
 BODY_REACH, BODY = 6.0, (7.0, 12.0)
-"""Distance around a block within which particles are counted [spacings], and the weighted counts of a drop and of a
-body of fluid; there are 85 within fluid."""
+"""Distance for counting particles around a block [spacings], and the counts for a drop and for bulk fluid."""
 TOUCHING = wp.constant(27)
 
 
 @wp.struct
 class Still:
-    """The fluid in one frame of a film, in the form that other frames need to average with it."""
+    """The fluid in one frame of a film, for averages over frames."""
 
     b: Blocks
     blocks: Ints
     first: wp.vec3i
     means: Floats
-    """(blocks,) mean level"""
+    """Mean density of the fluid in each block (blocks,)."""
     bodies: Floats
-    """(blocks,) 1 in a body of fluid, and 0 in drops"""
+    """Values from 0 for drops to 1 for bulk fluid (blocks,)."""
     light: Vec3s2d
-    """(nodes, nodes) light that the fluid leaves on the floor"""
+    """Light on the floor behind the fluid (nodes, nodes)."""
 
 
 @wp.func
 def share(way: wp.float32, limits: wp.vec2):
-    """Return the weight of a displacement: 1 up to the first limit, 0 from the second on, smooth between."""
+    """Return a weight that falls smoothly from 1 at the first limit to 0 at the second limit."""
     x = wp.clamp((limits[1] - way) / (limits[1] - limits[0]), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 @wp.func
 def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
-    """Return the weight of another frame j, falling from 1 to 0; the first ``before`` frames are earlier ones, nearest
-    first."""
+    """Return the weight of frame ``j``, which decreases with its distance in time."""
     away = wp.where(j < before, j, j - before) + 1
     return 1.0 - float(away) / float(window + 1)
 
@@ -99,8 +96,7 @@ def find_means(first, own, s, reach, means, bodies):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_ways(first, own, others, width, touching, indices, ways):
-    """Compute for each block how far its fluid has moved in other frames [spacings], and the matching and adjacent
-    blocks."""
+    """Compute the displacement of the fluid between frames in each block [spacings]."""
     n = first + wp.tid()
     at = block_at(own.b, own.blocks[n])
     for k in range(TOUCHING):
@@ -121,8 +117,7 @@ def find_ways(first, own, others, width, touching, indices, ways):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_shares(first, touching, ways, bodies, before, window, limits, shares):
-    """Compute the weights of other frames in each block, from the root mean square displacement there and in adjacent
-    blocks."""
+    """Compute the weight of each frame in each block."""
     n = first + wp.tid()
     left = bodies[n]
     for j in range(ways.shape[1]):
@@ -195,8 +190,8 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """Average the `Still` of a frame with those of the frames before and after it, nearest first, until a lattice has
-    cubes of another size; ``spacing`` is that of the particles [m]."""
+    """Average the `Still` of a frame with the frames before and after it, which are given nearest first. All averaged
+    frames must have the same lattice. ``spacing`` is the particle spacing [m]."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

@@ -1,9 +1,8 @@
-"""The isosurface of a fluid's level, as a net with one corner in each lattice cube that it passes (Gibson 1998).
+"""The isosurface of a density, as a net with one corner in each lattice cube that the surface crosses (Gibson 1998).
 
-The level is stored at the nodes of a lattice fixed in space, divided into blocks of `WIDTH` cubes along each axis. The
-level at the blocks' corners tells which blocks the surface may pass; only in these all nodes are computed. Corners of
-the net in adjacent cubes are neighbours, so each has at most six. The net has a quadrilateral across each cube edge
-whose ends are on different sides of the surface.
+The density, called level, is stored at the nodes of a fixed lattice. The lattice is divided into blocks of `WIDTH`
+cubes along each axis. Nodes are computed only in blocks that may contain the surface. The net has a quadrilateral for
+each cube edge that the surface crosses.
 """
 
 from dataclasses import dataclass
@@ -27,32 +26,31 @@ from cortado.pictures.tracing.near_particles import (
 )
 
 WIDTH = wp.constant(4)
-"""Cubes along each axis of a block."""
+"""Number of cubes along each axis of a block."""
 CUBES = wp.constant(64)
 LEVEL = wp.constant(wp.float32(0.6))
-"""Level of the surface; within fluid the level is about 1."""
+"""Level of the isosurface; the level inside fluid is about 1."""
 
 
 ROUNDS_OF_NORMALS = 15
 Neighbours = wp.types.vector(6, wp.int32)
-"""Corners in the cubes below and above along each axis, or -1."""
+"""Indices of the net corners in the six adjacent cubes, or -1."""
 
 
 @wp.struct
 class Blocks:
-    """A lattice in blocks of cubes; a cube has the whole numbers (i, j, k) of its lowest node."""
+    """A lattice of cubes, divided into blocks."""
 
     lower: wp.vec3
-    """Corner of the first block [m]."""
     cube: wp.float32
-    """Width [m]."""
+    """Width of a cube [m]."""
     shape: wp.vec3i
     corners: wp.array3d(dtype=wp.float32)
-    """(blocks + 1 along each axis) level at the lower corner of each block"""
+    """Level at the corners of the blocks, an array over three axes."""
     places: Ints
-    """(blocks,) cumulative number of blocks that are in ``levels``"""
+    """Cumulative number of blocks that may contain the surface (blocks,)."""
     levels: Floats2d
-    """(blocks that the surface may pass, CUBES) level at nodes"""
+    """Level at the nodes of each block that may contain the surface (k, CUBES)."""
 
 
 @wp.func
@@ -69,7 +67,7 @@ def block_at(b: Blocks, number: wp.int32):
 
 @wp.func
 def index_of(b: Blocks, at: wp.vec3i):
-    """Return the index of a block in ``levels``; -1 without levels, and -2 outside the lattice."""
+    """Return the index of a block in ``levels``, -1 for a block without levels, or -2 outside the lattice."""
     if wp.min(wp.min(at[0], at[1]), at[2]) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
         return -2
     block = number_of(b, at[0], at[1], at[2])
@@ -81,7 +79,6 @@ def index_of(b: Blocks, at: wp.vec3i):
 
 @wp.func
 def entry_of(b: Blocks, node: wp.vec3i):
-    """Return the entry of a node in ``levels``, as one number, or -1."""
     index = index_of(b, node / WIDTH)
     if index < 0:
         return -1
@@ -91,7 +88,7 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """Return the level at a node, or, if it was not computed, that of its block's corner, which is on the same side."""
+    """Return the level at a node, or at the corner of the node's block if the level at the node was not computed."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -115,7 +112,7 @@ def volume(s: NearParticles, j: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def mark_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
-    """Mark the blocks' corners that a particle may reach by a level that is not 0."""
+    """Mark the block corners within reach of a particle."""
     p = s.places[first + wp.tid()] - b.lower
     wide = b.cube * float(WIDTH)
     low = (p - wp.vec3(reach)) / wide
@@ -141,7 +138,7 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: Ints):
-    """Mark in ``passed`` the blocks that the isosurface may cross, judged by the values at their eight corners."""
+    """Mark the blocks that may contain the surface."""
     n = first + wp.tid()
     at = block_at(b, n)
     least = wp.float32(1.0e9)
@@ -164,8 +161,8 @@ def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks,
 def level_blocks(
     s: Any, ends: tuple[np.ndarray, np.ndarray], cube: float, reach: float, launch: BandLauncher
 ) -> tuple[Any, wp.array]:
-    """Make `Blocks` over the box between the corners ``ends``, (3,) each [m], extended by ``reach`` [m], with the level
-    of particles ``s``. Return them and the indices of the blocks that the surface may cross."""
+    """Compute the level of particles ``s`` in the box between the corners ``ends``, each (3,) [m], extended by
+    ``reach`` [m]. Return the `Blocks` and the indices of the blocks that may contain the surface."""
     device, wide = launch.device, WIDTH * cube
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
     b, shape = Blocks(), (high - low).astype(int)
@@ -185,16 +182,17 @@ def level_blocks(
 class Cubes:
     b: Blocks
     blocks: Ints
-    """(blocks that the surface may pass,)"""
+    """Indices of the blocks that may contain the surface."""
     corners: Ints
-    """(cubes + 1,) number of corners in earlier cubes"""
+    """Cumulative number of net corners, (cubes + 1,)."""
     sides: Ints
-    """(cubes + 1,) number of quadrilaterals at the lowest nodes of earlier cubes"""
+    """Cumulative number of quadrilaterals, (cubes + 1,)."""
 
 
 @wp.func
 def signs_of(b: Blocks, node: wp.vec3i):
-    """Return which of a cube's eight nodes are within the fluid, as bits ``x + 2 y + 4 z``."""
+    """Return a bit mask of the cube's nodes inside the fluid. The node at offset (x, y, z) has the bit x + 2 y
+    + 4 z."""
     signs = wp.int32(0)
     for n in range(8):
         if level_at(b, node + wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)) > LEVEL:
@@ -228,7 +226,6 @@ def along(axis: wp.int32):
 
 @wp.func
 def differ(signs: wp.int32, m: wp.int32, n: wp.int32):
-    """Test whether the surface passes between two nodes of a cube."""
     return ((signs >> m) ^ (signs >> n)) & 1 == 1
 
 
@@ -275,7 +272,7 @@ def place_corners(
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def list_triangles(first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, triangles: Ints):
-    """List two triangles for each quadrilateral, cut along its shorter diagonal."""
+    """Split each quadrilateral into two triangles along its shorter diagonal."""
     n = first + wp.tid()
     side = cubes.sides[n]
     if cubes.sides[n + 1] == side:
@@ -305,7 +302,6 @@ def list_triangles(first: wp.int32, cubes: Cubes, signs: Ints, points: Vec3s, tr
 
 @wp.func
 def sum_beside(beside: Neighbours, values: Vec3s):
-    """Return the sum of values of the neighbours of a corner, and their number."""
     total = wp.vec3(0.0)
     count = wp.float32(0.0)
     for k in range(6):
@@ -317,7 +313,6 @@ def sum_beside(beside: Neighbours, values: Vec3s):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Floats, values: Vec3s, found: Vec3s):
-    """Move values towards the mean of their neighbours, by a fraction ``weights``."""
     v = first + wp.tid()
     total, count = sum_beside(neighbours[v], values)
     found[v] = wp.lerp(values[v], total / wp.max(count, 1.0), wp.where(count > 0.0, weights[v], 0.0))
@@ -325,7 +320,7 @@ def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Flo
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_normals(first: wp.int32, signs: Ints, neighbours: wp.array(dtype=Neighbours), points: Vec3s, normals: Vec3s):
-    """Compute at each corner the mean of the normals of the quadrilaterals around it, weighted by area."""
+    """Compute the area-weighted mean normal of the quadrilaterals around each corner."""
     v = first + wp.tid()
     beside = neighbours[v]
     total = wp.vec3(0.0)
@@ -360,18 +355,15 @@ def smooth_normals(first: wp.int32, neighbours: wp.array(dtype=Neighbours), valu
 class SurfaceNet:
     cubes: Any
     cube_signs: wp.array
-    """(cubes,) bits of the nodes within the fluid"""
     points: wp.array
-    """(corners,) of vec3 [m]"""
+    """Positions of corners (corners,) [m]."""
     signs: wp.array
-    """(corners,) `cube_signs` of each corner's cube"""
     neighbours: wp.array
-    """(corners,)"""
     sides: int
 
 
 def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
-    """Make the net of the level on `Blocks`; ``blocks`` are the numbers of those that the surface may pass."""
+    """Make the surface net of a level. ``blocks`` are the indices of the blocks that may contain the surface."""
     device, count, cubes = launch.device, len(blocks) * CUBES, Cubes()
     signs = wp.empty(count, dtype=wp.int32, device=device)
     cubes.b, cubes.blocks = b, blocks
@@ -386,13 +378,14 @@ def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
 
 
 def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
-    """Move values (p,) of vec3 towards the means of neighbours, in ``rounds`` rounds, by weights (p,) from 0 to 1."""
+    """Smooth vectors (p,) over their neighbours in several ``rounds``. Each round moves a vector towards the mean of
+    its neighbours by the fraction ``weights`` (p,)."""
     own = {"neighbours": neighbours, "weights": weights}
     return launch.to_and_fro(smooth, rounds, wp.clone(values), wp.empty_like(values), **own)
 
 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return the normals (p,) of vec3, unit vectors outwards, of a net whose corners were moved to points (p,)."""
+    """Return the outward unit normals (p,) of a net with corners at ``points`` (p,)."""
     normals, other = wp.empty_like(points), wp.empty_like(points)
     own = {"signs": net.signs, "neighbours": net.neighbours}
     launch(find_normals, len(points), **own, points=points, normals=normals)
@@ -400,7 +393,7 @@ def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.ar
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return the numbers (3 t,) of the corners of triangles, of a net whose corners were moved to points (p,)."""
+    """Return the triangles of a net with corners at ``points`` (p,), as corner indices (3 t,)."""
     found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
     given = {"cubes": net.cubes, "signs": net.cube_signs, "points": points}
     launch(list_triangles, len(net.cube_signs), **given, triangles=found)

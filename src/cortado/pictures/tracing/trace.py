@@ -1,11 +1,12 @@
-"""A ray tracer for one surface of fluid: light that it reflects, refracts, absorbs and scatters.
+"""A ray tracer for a fluid surface that reflects, refracts, absorbs and scatters light.
 
-Before rays are traced from the eye, `illuminate_kernel` computes the light on surfaces. A ray that hits the fluid is
-split by Fresnel's law. The reflected ray continues to the surroundings or other fluid. The refracted ray passes through
-fluid and out again, up to ``segments`` times. Along a length L in fluid, the fraction 1 - exp(-scattering L) of its
-light is replaced by the fluid's colour under the light that falls on it. The rest is multiplied by colour^(absorption
-L), by the Beer-Lambert law. A ray that leaves the fluid near the critical angle is split again, and its reflected part
-is followed. A ray uses the fluid's properties at its entry point all the way.
+First, `illuminate_kernel` computes the light on surfaces. Then rays are traced from the camera. At the fluid a ray is
+split by Fresnel's law. The reflected ray continues to the surroundings or to the fluid. The refracted ray passes
+through the fluid and leaves it again, up to ``segments`` times.
+
+Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light is replaced by the fluid's colour in
+the light on its surface. The remaining light is multiplied by colour^(absorption L), by the Beer-Lambert law. The
+optical properties of the entry point are used along the whole ray.
 """
 
 from functools import cache
@@ -35,19 +36,19 @@ from cortado.scene.appearance import Picture
 
 class Effort(NamedTuple):
     cube: float
-    """Least width of the surface lattice's cubes, in spacings."""
+    """Smallest width of the cubes of the surface lattice [spacings]."""
     segments: int
     contrast: float
-    """Contrast around a pixel, in linear light, above which the pixel gets more rays."""
+    """Contrast with neighbouring pixels in linear light, above which a pixel gets additional rays."""
     again: int
-    """Number of these additional rays, taken from `ROTATED_GRID`."""
+    """Number of additional rays of a pixel."""
     lights: tuple[int, int]
-    """Numbers of rays that sample the light on a point of the surface: from all directions, and from the lamp."""
+    """Numbers of light rays at a surface point, from all directions and from the lamp."""
 
 
 EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.045, 2, (8, 2))}
 SPHERE_LIGHTS, SOLID_LIGHTS = (10, 1), (40, 6)
-"""`Effort.lights` for spheres, and for solids, which have fewer points and flat sides."""
+"""Values of `Effort.lights` for spheres and for solids."""
 
 
 def effort_of(picture: Picture) -> Effort:
@@ -55,15 +56,15 @@ def effort_of(picture: Picture) -> Effort:
 
 
 BOUNCED = wp.constant(wp.float32(0.45))
-"""Fraction of the surrounding light that solids receive and reflect."""
+"""Fraction of the ambient light that a solid reflects."""
 
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """Return the part of ``light`` that reaches a point from direction d past solids within ``reach`` [m].
+    """Return the part of ``light`` from direction ``d`` that reaches the point ``p`` past solids within ``reach`` [m].
 
-    A solid blocks light, less so with distance, and sends a little light of its colour. Points inside a solid are
-    invisible and get all light.
+    A near solid blocks more light than a distant solid, and adds a little light of its colour. A point inside a solid
+    gets all light.
     """
     hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
@@ -96,8 +97,7 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def illuminate(first, s, surface, points, normals, directions, sun_directions, reach, clearness, light):
-        """Compute the light on each point of a surface: from the lamp, and from all directions without other fluid or a
-        solid within ``reach`` [m]."""
+        """Compute the light on each surface point, from the lamp and from all directions."""
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n
@@ -136,15 +136,15 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 INDEX = wp.constant(wp.float32(1.33))
 FAINT = wp.constant(wp.float32(0.05))
-"""Reflectance below which light leaving fluid is not split; above it, rescaling the reflectance avoids a visible
-edge."""
+"""Reflectance below which a ray at the surface is not split."""
 DARK = wp.constant(wp.float32(10.0))
-"""Number of mean free paths in fluid beyond which light is neglected: a fraction of 5e-5 gets that far."""
+"""Number of mean free paths in fluid after which light is neglected."""
 
 
 @wp.struct
 class Eye:
-    """A camera; pixel (column, row) looks along ``forward + a right + b up``, a and b from -1 to 1."""
+    """A camera. The ray of a pixel at screen coordinates a and b from -1 to 1 has the direction ``forward + a right + b
+    up``."""
 
     position: wp.vec3
     forward: wp.vec3
@@ -156,7 +156,7 @@ class Eye:
 
 @wp.func
 def toned(colour: wp.vec3):
-    """Compress bright light to below 1; light up to 0.75 is unchanged."""
+    """Compress bright light to values below 1. Light up to 0.75 is unchanged."""
     found = wp.vec3(0.0)
     for k in range(3):
         x = colour[k]
@@ -168,8 +168,7 @@ def toned(colour: wp.vec3):
 
 @wp.func
 def tinted(colour: wp.vec3, taken: wp.float32):
-    """Return white light after coloured fluid has absorbed a fraction ``taken`` of the other colours; at 1 the fluid's
-    colour."""
+    """Return the colour of white light after absorption in the fluid. ``taken`` is the absorbed fraction."""
     base = wp.vec3(wp.max(colour[0], 0.02), wp.max(colour[1], 0.02), wp.max(colour[2], 0.02))
     return wp.vec3(wp.pow(base[0], taken), wp.pow(base[1], taken), wp.pow(base[2], taken))
 
@@ -183,7 +182,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.func
     @typed
     def within(s, shadow, surface, start, direction, entered, spread):
-        """Return the light that leaves the fluid backwards along a ray that was refracted into it."""
+        """Return the light along a ray inside the fluid."""
         found = wp.vec3(0.0)
         through = wp.vec3(1.0)
         o = start
@@ -293,7 +292,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def trace(first, eye: Eye, s, surface, shadow, pixels, offsets, image):
-        """Compute the light of some pixels: the mean over ``offsets`` in the pixel, from -0.5 to 0.5."""
+        """Compute the light of pixels, as the mean over rays at ``offsets`` [pixels]."""
         pixel = pixels[first + wp.tid()]
         spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
         light = wp.vec3(0.0)
@@ -308,15 +307,13 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 
 ROTATED_GRID = ((-0.375, -0.125), (0.375, 0.125), (-0.125, 0.375), (0.125, -0.375))
-"""Offsets of additional rays from the middle of a pixel, in pixels."""
+"""Offsets of additional rays from the middle of a pixel [pixels]."""
 MIDDLE = ((0.0, 0.0),)
 TILE = 8, 4
-"""Columns and rows."""
 
 
 def in_tiles(columns: int, rows: int) -> np.ndarray:
-    """Return the numbers of every second pixel, as on a chequerboard, in small tiles, whose rays are nearly
-    parallel."""
+    """Return the indices of the white pixels of a chequerboard, ordered in small tiles."""
     wide, high = TILE
     row, column = np.divmod(np.arange(columns * rows), columns)
     tile = (row // high) * -(-columns // wide) + column // wide
@@ -326,8 +323,8 @@ def in_tiles(columns: int, rows: int) -> np.ndarray:
 
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
-    """Fill the black squares of a chequered ``image`` by the mean of their neighbours. Mark in ``found`` the black and
-    white squares around which colours differ by more than ``contrast``."""
+    """Fill every second pixel of a chequerboard image with the mean of its neighbours. Set ``found`` to 1 at pixels
+    that differ from neighbouring pixels by more than ``contrast``."""
     i = first + wp.tid()
     column = i % columns
     row = i / columns

@@ -1,15 +1,18 @@
-"""One predictive-corrective iteration (Solenthaler and Pajarola 2009):
+"""One pressure iteration of PCISPH (Solenthaler and Pajarola 2009):
 
     p_i  = max(p_i + delta y_i (m_i n*_i - rho_0i), 0),   delta = k / dt^2
     c_i  = p_i / n_i^2
     ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b w_b c_i G_ib)
     v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
 
-n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008), y the
-relaxation beside walls (`cortado.solvers.pcisph.solver`). G is taken at x(t), n* at the predicted positions over the
-neighbours of x(t). The force, including the force of walls, is the transpose of the derivative of n with respect to
-positions: moving particles against the force takes the work V sum_i c_i dn_i. After the last iteration (x*, v*) is the
-new state. The clamp at 0 (no suction at a free surface) has the derivative [p > 0].
+n is the number density (`cortado.sph.density`; for fluids of different masses: Solenthaler and Pajarola 2008). y is the
+relaxation beside walls (`cortado.solvers.pcisph.solver`), w_b the weight of wall particle b, and a_i the explicit
+acceleration. The kernel gradients G are taken at the positions x(t), and n* at the predicted positions x* over the
+neighbours of x(t).
+
+The force, including the force of walls, is the transpose of the derivative of n with respect to positions. Moving
+particles against the force therefore takes the work V sum_i c_i dn_i. After the last iteration (x*, v*) is the new
+state. The maximum with 0 prevents suction at a free surface. Its derivative is 1 for p > 0, else 0.
 """
 
 from functools import cache
@@ -41,8 +44,8 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
     @typed.kernel(discretisation.module(True, "pcisph"))
     def pressure(s, k: int, rounds, stiffness: real, time_step, n, m, rho_0, y, x_star, p_in, p_out, c, error):
-        """Write p_out = max(p_in + delta y (m n* - rho_0), 0), with n* of positions ``x_star``, and c = p_out / n^2.
-        ``error`` gets the compression (rho* - rho_0)+ / rho_0 twice, for a sum and a maximum."""
+        """Write the new pressure ``p_out``. ``c`` is the new pressure divided by the squared number density. ``error``
+        gets the relative compression."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -92,7 +95,6 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
     def pressure_adjoint(
         s, k: int, rounds, time_step, m, v, x_star, v_star, r, x_bar, v_bar, time_step_bar, scaled_bar
     ):
-        """Add to adjoints of positions, velocities and time step, given r, the adjoint of the predicted density n*."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -111,7 +113,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
 
 def pressure_term(d: Discretisation) -> Any:
-    """Make the work function by which ``scaled_bar`` acts on solids."""
+    """Make the Warp function for the adjoints of solids."""
     real, vector, slope = d.precision.real, d.precision.vector, pair_functions(d).slope
 
     def pressure_work(x_ij: vector, c_i: real, scaled_bar_i: vector, s: neighbourhood_type(d.precision)) -> real:
@@ -135,7 +137,6 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def adjoin_pressure(
         i: int, stiffness: real, dt: real, volume: real, divergence: real, work: real, at: values, bar: adjoints
     ) -> real:
-        """Add to the adjoints of a pressure correction's inputs; return r, the adjoint of n*."""
         n_i = at.n[i]
         m_i = at.m[i]
         p_i = at.p_out[i]
@@ -168,7 +169,6 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def force_adjoint(
         x_ij: vector, c_i: real, c_j: real, scaled_bar_i: vector, scaled_bar_ij: vector, s: neighbourhood
     ) -> tuple[vector, real, real]:
-        """Return a pair's Hessian product, its divergence, and the work of c_i."""
         a = slope(x_ij, s)
         c_ij = c_i + c_j
         change = (c_ij * a) * scaled_bar_ij + (c_ij * slope_change(x_ij, scaled_bar_ij, s)) * x_ij
@@ -220,8 +220,7 @@ def pressure_force_kernels(discretisation: Discretisation) -> Kernels:
     def pressure_force_adjoint(
         s, k: int, rounds, stiffness: real, time_step, x, at: values, c, scaled_bar, x_bar, n_bar, bar: adjoints, r
     ):
-        """Compute the adjoints of c, p and n* (``r``) from ``scaled_bar``, the adjoint of the pressure acceleration
-        over m."""
+        """Compute the adjoints of ``c``, of the pressure and of the predicted number density (``r``)."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:

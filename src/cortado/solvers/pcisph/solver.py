@@ -1,24 +1,26 @@
-"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009) as the solver of a scene: its steps, their
-tangent and adjoint, and two factors on the pressure correction delta of an iteration.
+"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009): steps, their tangent and adjoint, and two
+factors on the pressure correction delta of an iteration.
 
-delta is derived for particles of equal mass, but a particle's pressure moves lighter neighbours further, by the ratio
-of the masses. The iteration diverges if a density changes by more than twice the wanted amount, so delta is multiplied
-by the density-ratio relaxation
+*Density ratios*: delta is derived for particles of equal mass, but a pressure moves lighter neighbours further, by
+the ratio of the masses. The iteration diverges if a density changes by more than twice the wanted amount. delta is
+therefore multiplied by the density-ratio relaxation
 
     1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
 
-which is 1 among particles of equal or greater mass, and tends to 1 / (1 + t / 2), the value for a lattice. The constant
-a makes e smooth at t = 0.
+which is 1 among particles of equal or greater mass. For large t it tends to 1 / (1 + t / 2), the value for a lattice.
+The constant a makes e smooth at t = 0.
 
-delta is derived for a particle with a filled neighbourhood. Beside a wall the same pressure changes a particle's own
-density more, by |S_i|^2 / (2 sum_j G_j . G_j of the prototype) with S_i = sum_b w_b G_ib. Beyond 2 the iteration
-overshoots and kicks the particle away. A particle that approaches a wall meets a steeper gradient than at the start of
-the step, so the response is doubled: delta is multiplied by the wall relaxation
+*Walls*: delta is derived for a particle with a filled neighbourhood. Beside a wall the same pressure changes the
+density of the particle more, by |S_i|^2 / (2 sum_j G_j . G_j) with the sum S_i = sum_b w_b G_ib over wall particles
+b and the kernel gradients G_j on a lattice. Above 2 the iteration overshoots and pushes the particle away. A
+particle that approaches a wall meets a steeper gradient than at the start of the step, so the response is doubled.
+delta is multiplied by the wall relaxation
 
     y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
 
-which is 1 away from walls, and smooth. The relaxation changes the rate of convergence, not the limit. Sums are
-multiplied by response^(-1/2) before they are squared: in float32 the square of a gradient overflows for small spacings.
+which is smooth, and 1 away from walls. The relaxation changes the rate of convergence, not the limit. Sums are
+multiplied by response^(-1/2) before they are squared, because the square of a gradient overflows in float32 for small
+spacings.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,13 +52,12 @@ from cortado.sph.density import density_solid_kernel, wall_slope_sums, wall_slop
 from cortado.sph.parts import StepContext
 
 SOFTNESS = 0.2
-"""The softness a of the density-ratio relaxation [-]."""
+"""Width of the smooth corner in the relaxation for lighter neighbours [-]."""
 
 
 @cache
 def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the kernels of t, and of y from t and the relaxation beside walls; the adjoint of y overwrites the adjoints
-    of both."""
+    """Make the kernels of the relaxation for lighter neighbours."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
@@ -82,7 +83,7 @@ def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
         return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
 
     def relaxation(wall_y_i: real, t_i: real) -> real:
-        """Return y_wall / (1 + e(t))."""
+        """Return the product of the two relaxation factors."""
         excess = real(0.0)
         if t_i > real(0.0):
             excess = real(0.5) * t_i * t_i / (t_i + a)
@@ -98,7 +99,6 @@ def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def wall_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the pressure relaxation beside walls."""
     real, vector, neighbourhood = discretisation.types
     sums = wall_slope_sums(discretisation)
     slope, change, LANES = sums.slope, sums.change, discretisation.lanes
@@ -117,7 +117,6 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
 
     @typed.kernel(adjoint_module)
     def wall_relaxation_adjoint(s, x, y, y_bar, x_bar, slope_bar):
-        """Add to the adjoint of positions from that of y; ``slope_bar`` gets the adjoint of S."""
         i = s.first + wp.tid() // LANES
         total = s.response_scale * slope(i, x, s)
         along = (real(-2.0) * y_bar[i] * y[i] * y[i] * s.response_scale) * total
@@ -132,7 +131,7 @@ def wall_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def scaling_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel of the adjoint of the pressure acceleration over m."""
+    """Make the kernel that divides the adjoint of the pressure acceleration by the particle's density."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     @particle_kernel(discretisation.module(False, "pcisph"), "scaled_bar")
@@ -143,14 +142,15 @@ def scaling_kernel(discretisation: Discretisation) -> Any:
 
 
 class Iterates:
-    """Predicted states and pressures of the iterations of one step; a run overwrites a single slot."""
+    """Predicted states and pressures of the iterations of a step. Without derivatives, only the latest iteration is
+    stored."""
 
     def __init__(self, numbers: Callable[[], wp.array], vectors: Callable[[], wp.array]):
         self._numbers, self._vectors = numbers, vectors
         self.x_star: list[wp.array] = []
         self.v_star: list[wp.array] = []
         self.p: list[wp.array] = [numbers()]
-        """``p[k]`` before iteration k; ``p[0]`` is 0 and never written."""
+        """Pressures before each iteration. ``p[0]`` is always 0."""
         self.c: list[wp.array] = []
         self.reserve(1)
 
@@ -166,7 +166,7 @@ class Pcisph(ParticleSolver):
     topic = "pcisph"
 
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
-        """Prepare steps of a system; ``limits`` None leaves the pressure out."""
+        """Prepare the solver. With ``limits`` None there is no pressure."""
         super().__init__(system, requires_grad)
         self.limits, own = limits, self.discretisation
         self.kernels = SimpleNamespace(
@@ -179,8 +179,7 @@ class Pcisph(ParticleSolver):
         wall_y, t = self.numbers(), self.numbers()
         y = self.numbers() if self.layout.phases > 1 else wall_y
         self.known: dict[str, Any] = {"wall_y": wall_y, "t": t, "y": y, "stiffness": self.lattice.stiffness}
-        """Arguments of kernels by name: the relaxation beside walls, t, and y (n,), the factor of delta [-], below 1
-        beside walls and among lighter neighbours."""
+        """Arrays of the relaxation factors, by names of kernel arguments."""
         self.iterates = Iterates(self.numbers, self.vectors)
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
@@ -220,8 +219,8 @@ class Pcisph(ParticleSolver):
         return PcisphAdjoint(self, steps)
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Do all of a step before the pressure iterations: sort, compute y, add up explicit forces, and predict v* = v
-        + dt a, x* = x + dt v*."""
+        """Compute a step up to the pressure iterations: sort particles, add up forces, and predict velocities and
+        positions."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             context.launch(self.kernels.wall_relaxation.forward, y=self.known["wall_y"])
@@ -234,7 +233,7 @@ class Pcisph(ParticleSolver):
         return context
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
-        """Do pressure iteration k, from the previous slot to ``slot``; a run uses only slot 0."""
+        """Compute pressure iteration ``k`` and store it in ``slot``."""
         it, before = self.iterates, max(slot - 1, 0)
         pressures = {"p_in": it.p[0] if k == 0 else it.p[max(slot - 1, 1)], "p_out": it.p[max(slot, 1)]}
         pressures |= {"x_star": it.x_star[before], "c": it.c[before], "error": self.pressure_loop.errors}
@@ -267,7 +266,6 @@ class PcisphAdjoint(ParticleAdjoint):
         self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        """Turn the adjoint of a step's result into the adjoint of the last prediction."""
         (iterations,) = counts
         solver = self._solver
         context = solver.context(parameters)

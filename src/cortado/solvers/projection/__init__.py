@@ -1,1 +1,1 @@
-"""The velocity projection: its pressures push and pull, and it keeps particles evenly spaced."""
+"""The projection of velocities to zero divergence, with pressures that may be negative."""

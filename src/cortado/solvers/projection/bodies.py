@@ -40,9 +40,11 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @cache
 def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the kernels by which particles push bodies. ``hold`` computes gamma and r, ``measure`` |gamma| and |r x
-    gamma|, ``weigh`` the bodies' term in the diagonal a from these and their sums ``whole``, and ``pull`` the momenta y
-    gamma and y r x gamma. ``share`` adds the adjoint of ``whole`` to those of ``measure``."""
+    """Make the kernels of the push of particles on rigid bodies.
+
+    ``hold`` computes the push of a unit pressure and its arm. ``measure`` and ``weigh`` compute the body's term in the
+    diagonal of the pressure iteration. ``pull`` computes each particle's momentum on the body.
+    """
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, pair = precision.pair, pair_functions(discretisation)
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
@@ -52,7 +54,7 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def between(a: vector, foot: vector, edge: real) -> vector:
-        """Return a's part along a wall's normal, plus e times its part across the normal."""
+        """Return the part of ``a`` along a wall's normal, plus ``edge`` times the remaining part."""
         part = normal(a, foot)
         return part + edge * (a - part)
 
@@ -86,7 +88,6 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
     def hold_adjoint(
         total: vector, edge_part: real, gamma_of_i: vector, arm_i: vector, gamma_of_bar_i: vector, arm_bar_i: vector
     ) -> tuple[real, vector, vector, vector]:
-        """Apply the adjoint of gamma and r; turning a body turns gamma."""
         torque = wp.cross(gamma_of_i, gamma_of_bar_i) - wp.cross(arm_i, total)
         return edge_part, total + arm_bar_i, -total - arm_bar_i, torque
 
@@ -105,8 +106,7 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
 
     @particle_kernel(tangent_module, "pulled_dot twisted_dot", typed=typed)
     def pull_tangent(y_i, y_dot_i, gamma_of_i, gamma_of_dot_i, arm_i, arm_dot_i) -> tuple[vector, vector]:
-        """Write the tangents of `pull` by hand, because a generated kernel is slower and each iteration runs this
-        one."""
+        """Write the tangents of `pull`. A generated kernel would be slower."""
         turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
         return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn
 
@@ -125,8 +125,7 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def motion_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels that move bodies by the sums of y gamma and y r x gamma, and those of the drift of walls by the
-    velocity changes."""
+    """Make the kernels that move rigid bodies by the momenta of pressures."""
     real, vector = precision.real, precision.vector
 
     def carry(faster: vector, turned_faster: vector, gamma_of_i: vector, arm_i: vector) -> real:
@@ -141,27 +140,27 @@ Arrays = dict[str, wp.array]
 
 
 class Held:
-    """Arrays of particles about one body, or tangents or adjoints with names that end in ``suffix``."""
+    """Arrays of the particles near one rigid body. ``suffix`` selects tangents or adjoints."""
 
     def __init__(self, body: FreeBody, layout: Layout, begun: FreeBody | Changes, suffix: str = ""):
         self.body, self.given, self._layout = body, begun.given, layout
         self.start = {f"{name[0]}_0{name[1:]}": array for name, array in begun.before.items()}
-        """V_0, W_0 and L_0 before pressures push the body, with precedence over other arrays of a step."""
+        """Velocity, angular velocity and angular momentum of the body without pressures."""
         precision, vector, device = layout.precision, layout.precision.vector, layout.device
         self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
         self.moved = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in "VWL"}
-        """V, W and L of the body in an iteration."""
+        """Velocity, angular velocity and angular momentum of the body with the pressures of an iteration."""
         names = ("faster", "turned_faster")
         self.faster = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in names}
-        """V - V_0 and W - W_0."""
+        """Changes of velocity and angular velocity by pressures."""
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
-        """Sums over particles of |gamma| and |r x gamma|."""
+        """Sums over particles of the magnitudes of their force and torque on the body."""
 
     def at_rest(self) -> "Held":
-        """Return a copy that shares the arrays but begins at rest, for a step of length 0 without gravity."""
+        """Return a copy with the same arrays for a body at rest."""
         other = copy(self)
         vector, real = self._layout.precision.vector, self._layout.precision.real
         kinds = {"V_0": vector, "W_0": vector, "L_0": vector, "time_step": real}
@@ -173,12 +172,12 @@ class Held:
         self.whole = {f"whole{self._suffix}": self._whole(self.known[f"sizes{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """Return (members,) sums of y gamma and y r x gamma."""
+        """Return the momentum and angular momentum by pressures (members,)."""
         found = (total(share) for total, share in zip(self._sums, self.shares.values(), strict=True))
         return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
 
     def pushes(self) -> Arrays:
-        """Return `sums` with the momenta that contacts, springs and friction give."""
+        """Return the momentum and angular momentum by pressures, contacts, springs and friction."""
         found = self.sums()
         for given, total in zip(self.given.values(), found.values(), strict=False):
             add(given, total)
@@ -199,8 +198,7 @@ class Bodies:
         return [{**held.moved, **held.faster} for held in self.held]
 
     def at_rest(self) -> "Bodies":
-        """Return a copy of these bodies that begins at rest without hinges, so that `drifted` is linear in the
-        pressures."""
+        """Return a copy for bodies at rest without hinges. The result of `drifted` is then linear in the pressures."""
         other = copy(self)
         other.joints = Joints(self.part, (), self.layout)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
@@ -211,8 +209,7 @@ class Bodies:
         return *own, *held.body.known(context), self._around
 
     def begin(self, context: StepContext, k: wp.array) -> None:
-        """Compute pushes on bodies and their term in the diagonal. For bodies without slip, compute the momenta by the
-        pressures ``k`` of the previous step."""
+        """Compute the push of particles on bodies at the start of a step. ``k`` are the pressures of the last step."""
         self.joints.begin(context)
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held))
@@ -224,8 +221,8 @@ class Bodies:
                 copy_each(held.sums(), held.body.pressed)
 
     def loosen(self, context: StepContext, y: wp.array) -> list[Arrays]:
-        """Write V, W and L that pressures y give to bodies without hinges; return the sums of y gamma and y r x
-        gamma."""
+        """Write the velocities of bodies under pressures ``y`` without the effect of hinges. Return the momenta by
+        pressures."""
         found = []
         for held in self.held:
             known = self.known(context, held)
@@ -235,12 +232,12 @@ class Bodies:
         return found
 
     def join(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies with hinges."""
+        """Write the velocities of bodies with hinges under pressures ``y``."""
         self.loosen(context, y)
         self.joints.join(context, self.velocities)
 
     def drifted(self, context: StepContext, drift: wp.array, y: wp.array) -> wp.array:
-        """Return the drift of walls for the velocities that pressures y give to bodies."""
+        """Return the divergence that walls cause when bodies move under pressures ``y``."""
         self.join(context, y)
         for held in self.held:
             known = self.known(context, held)
@@ -249,14 +246,13 @@ class Bodies:
         return drift
 
     def settle(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities that pressures y give to bodies, as those at the end of the step."""
+        """Write the velocities of bodies at the end of the step under pressures ``y``."""
         self.join(context, y)
         for held in self.held:
             copy_each(held.moved, held.body.moved)
 
 
 def copy_each(given: Named, to: Named) -> None:
-    """Copy arrays to others in the same order."""
     for source, array in zip(given.values(), to.values(), strict=True):
         wp.copy(array, source)
 
@@ -322,7 +318,6 @@ class BodiesAdjoint:
         layout = bodies.layout
         self._held = [Held(own.body, layout, own, "_bar") for own in changes]
         self.drift_bar = wp.zeros_like(bodies.drift)
-        """The adjoint of the drift of one iteration."""
         self._turned = [{"turned_bar": wp.zeros_like(own.turned_end)} for own in changes]
         self._joints = JointsAdjoint(bodies.joints, bar, self._turned)
         shares = layout.arrays("_bar", whole=layout.precision.pair, density=layout.precision.real)
@@ -349,7 +344,6 @@ class BodiesAdjoint:
                 array.zero_()
 
     def _loosen(self, context: StepContext, y: wp.array, y_bar: wp.array) -> None:
-        """Turn the adjoints of bodies' V, W, L, V - V_0 and W - W_0 into the adjoint of the pressures y."""
         bodies, bars = self._bodies, [{**own.moved, **own.faster} for own in self._held]
         sums = bodies.loosen(context, y)
         self._joints.join(context, bodies.velocities, bars)
@@ -371,14 +365,12 @@ class BodiesAdjoint:
                 array.zero_()
 
     def drifted(self, context: StepContext, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of `Bodies.drifted` to ``self.drift_bar``, add this array to ``drift_bar``, and set it to
-        0."""
+        """Apply the adjoint of `Bodies.drifted`, and add to ``drift_bar`` and ``y_bar``."""
         self.carried(context, self.drift_bar, y, y_bar)
         add(self.drift_bar, drift_bar)
         self.drift_bar.zero_()
 
     def carried(self, context: StepContext, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of the part that `Bodies.drifted` adds to the drift."""
         bodies = self._bodies
         bodies.join(context, y)
         for k, held in enumerate(bodies.held):
@@ -389,8 +381,6 @@ class BodiesAdjoint:
         self._loosen(context, y, y_bar)
 
     def release(self, context: StepContext, k_before: wp.array, k_before_bar: wp.array) -> None:
-        """Apply, after `finish`, the adjoint of the momenta of bodies without slip, given the previous step's pressures
-        and their adjoints."""
         for k, held in enumerate(self._bodies.held):
             if held.body.table.sticks:
                 for array in self._held[k].known.values():

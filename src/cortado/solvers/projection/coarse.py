@@ -1,9 +1,9 @@
-"""A coarse correction of the pressure, by which enclosed water feels all of its walls within one step.
+"""A correction of the pressure on a coarse grid.
 
-An iteration of `cortado.solvers.projection.pressure` spreads a pressure by one or two spacings; the coarse correction
-before it removes the smooth part of the error, on a grid with nodes two spacings apart. The first iteration starts from
-the previous step's pressure and needs a correction only in a cold scene. `cortado.solvers.projection.coarse_pressure`
-has the equations; Takahashi and Lin 2016 have a multilevel particle solver.
+A pressure iteration spreads a pressure by one or two spacings only. The coarse correction before an iteration removes
+the smooth part of the error, on a grid with nodes two spacings apart. The first iteration starts from the pressure of
+the last step, and has a coarse correction only without an earlier pressure. `docs/projection_step.md` has the
+equations. Takahashi and Lin (2016) have a multilevel particle solver.
 """
 
 from collections.abc import Callable
@@ -35,17 +35,17 @@ from cortado.sph.moment_functions import round_off, symmetric
 from cortado.sph.parts import Adjoints, StepContext
 
 LEAST = 1e-5
-"""The regularisation eps of a node's particles, relative to A_II on the lattice."""
+"""Regularisation of the coarse matrix, relative to its diagonal on the lattice."""
 CLOSE = 1e-3
-"""Part of the first residual, in the norm of A^-1, at which a solve in float32 ends."""
+"""Relative tolerance of a coarse solve in float32."""
 MOST = 1_000
 
 
 class Coarse:
-    """The coarse pressure correction of one solver: its grid, matrix and solves."""
+    """The coarse pressure correction of a solver: its grid, matrix and solves."""
 
     def __init__(self, system: ParticleSystem, grid: Grid, bodies: Bodies | None, endless: bool):
-        """Allocate for the particles of a system and free ``bodies``; an ``endless`` scene has no correction."""
+        """Allocate arrays. An ``endless`` scene, with all axes periodic, has no coarse correction."""
         self.endless, dimension, spacing = endless, system.walled.dimension, system.walled.spacing
         discretisation, layout = system.discretisation, system.layout
         precision, device = layout.precision, layout.device
@@ -61,18 +61,18 @@ class Coarse:
         rows = 0 if self.bodies is None else self.bodies.rows
         self._levels = Levels(precision, dimension, grid.shape, layout.members, device, rows)
         self._parts = wp.zeros((2**dimension, len(self._levels.r)), dtype=real, device=device)
-        """(corners, cells) terms of cells in the spread `source`"""
+        """Terms of the right-hand side by cell (corners, cells)."""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
         self.pushed = layout.arrays(h=vector, N=precision.matrix, T=symmetric(precision).kind)
-        """h, N and c L of the sorted particles."""
+        """Force of a coarse pressure on sorted particles (`cortado.solvers.projection.coarse_push`)."""
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
         self.warm, self._none_stays = (wp.zeros(layout.members, dtype=wp.int32, device=device) for _ in range(2))
-        """``warm`` is 1 for warm scenes (`cortado.solvers.projection.pressure`)."""
+        """``warm`` is 1 for each scene that starts with a pressure."""
         self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
-        """Zeros, because the results of an earlier correction may not be finite if its run was lost."""
+        """Zeros as initial values of the coarse pressure."""
         self.still = layout.arrays(still=vector)["still"]
         self.unmoved = {"carried": layout.arrays(carried=real)["carried"]}
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
@@ -81,13 +81,13 @@ class Coarse:
         return wp.zeros_like(self._levels.r)
 
     def room(self) -> dict[str, wp.array]:
-        """Make arrays for a correction's results besides the iterate."""
+        """Allocate arrays for the results of a correction."""
         layout, (real, vector, pair) = self._particles, self._kinds
         kept = layout.arrays(r=real, change=real, thrust=vector)
         return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
 
     def begin(self, context: StepContext, known: Named) -> None:
-        """Compute the matrix of a step, and record whether all scenes are warm."""
+        """Compute the coarse matrix of a step."""
         if self.endless:
             return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
@@ -102,8 +102,7 @@ class Coarse:
             self.bodies.begin(context, self.grid, known, self._levels.B)
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
-        """Call ``correct`` before iteration k > 0, and before the first iteration if a scene is cold. An endless scene
-        needs no correction, which would only change the level of pressures."""
+        """Call ``correct`` if iteration ``k`` needs a coarse correction."""
         if self.endless:
             return
         if k > 0:
@@ -112,15 +111,15 @@ class Coarse:
             wp.capture_if(self._all_warm, on_false=correct)
 
     def solve(self, context: StepContext, before: wp.array, e: wp.array) -> None:
-        """Write to ``e`` (nodes,) the solution of A e = s, where s is the `source` spread with the e ``before``."""
+        """Solve for the coarse pressure ``e`` (nodes,). ``before`` is an earlier coarse pressure."""
         parts, r = self._parts, self._levels.r
         context.launch(self.nodes.spread, self.grid, self.source, e=before, parts=parts, threads=len(r))
         context.launch(self.nodes.gather, self.grid, parts=parts, r=r, threads=len(r))
         self._levels.solve(e, self._tolerance, MOST)
 
     def correct(self, context: StepContext, k: int, known: Named, at: Named, new: Named) -> None:
-        """Correct the pressure before iteration k: from an iterate ``at`` write k, y and u of a ``new`` iterate with
-        `room`. ``known`` has the arrays of the step with the drift of walls; its T is overwritten."""
+        """Correct the pressure before iteration ``k``. ``at`` are the arrays before and ``new`` after the
+        correction."""
         context.launch(self.residual.forward, at, new, self.source, known)
         self.solve(context, self._none, new["e"])
         context.launch(self.pressure.correct, at, new, self.grid, known)
@@ -136,7 +135,7 @@ class Coarse:
         return {"first": int(k == 0), "stays": self.warm if k == 0 else self._none_stays}
 
     def carried(self, context: StepContext, change: wp.array) -> dict[str, wp.array]:
-        """Return the divergence G d that a pressure change d removes by moving free bodies."""
+        """Return the divergence that a pressure change removes by moving free bodies."""
         return self.unmoved if self.bodies is None else {"carried": self.bodies.carried(context, change)}
 
 
@@ -204,9 +203,8 @@ class CoarseAdjoint:
             array.zero_()
 
     def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
-        """Apply the adjoint of the correction before iteration k: from the adjoints of k, y and u of the ``new``
-        iterate to those of k and y of the iterate ``at``. Write d_bar and S, which give the rest of the adjoint of
-        u."""
+        """Apply the adjoint of the coarse correction before iteration ``k``. ``at`` are the adjoints before and ``new``
+        after the correction."""
         own, found, known = self._coarse, self._steps, self._known
         context.launch(own.length.apply.adjoint, at, new, found, *known)
         known[0]["k_bar"].zero_()
@@ -227,7 +225,7 @@ class CoarseAdjoint:
         context.launch(own.residual.adjoint, drift, at, found, *known)
 
     def finish(self, context: StepContext) -> None:
-        """Turn the adjoints of the coarse push h and N into those of particles and surroundings."""
+        """Convert the adjoints of coarse forces to adjoints of particles."""
         for kernel in self._coarse.push.adjoint:
             context.launch(kernel, self._bars, self._coarse.pushed, *self._known)
         given = {"u": self._bars["h_bar"], "slope": self._bars["N_bar"]}

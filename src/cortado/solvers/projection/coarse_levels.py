@@ -1,11 +1,13 @@
-"""A multigrid by which solves on the coarse grid of the pressure take few iterations.
+"""A multigrid method, with which solves on the coarse grid of the pressure take few iterations.
 
 Each level has half of the nodes of the finer level along every axis with an even number of nodes. Its matrix is R A R^T
-(Galerkin), with the matrix A of the finer level and bilinear R, and is a sum over cells like A. The solve
-(`cortado.solvers.projection.coarse_solve`) smooths by steps of Jacobi's method, x + w (r - A x), with w_I = W /
-(sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)). With W below 2 Jacobi's method converges for every symmetric positive
-semidefinite matrix. With W = 1, w A has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the
-matrix whose diagonal is scaled to 1).
+(Galerkin), with the matrix A of the finer level and bilinear R. Like A, it is a sum over cells. The solve
+(`cortado.solvers.projection.coarse_solve`) smooths by Jacobi steps x + w (r - A x), with the weight of node I
+
+    w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)).
+
+With the factor W below 2 Jacobi's method converges for every symmetric positive semidefinite matrix. With W = 1, w A
+has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix whose diagonal is scaled to 1).
 """
 
 from functools import cache
@@ -24,13 +26,12 @@ from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_
 from cortado.sph.parts import StepContext
 
 FEWEST = 4
-"""Least number of nodes along an axis that a coarser grid may halve."""
+"""Smallest number of nodes along an axis of a coarser grid."""
 W = wp.constant(1.9)
 
 
 @cache
 def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the kernels for the matrices of coarser grids."""
     real = precision.real
     module = kernel_module(f"coarse_levels_{dimension}d_{precision.name}")
     AROUND, CORNERS, among = wp.constant(3**dimension), wp.constant(2**dimension), node_functions(dimension)
@@ -40,8 +41,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.struct
     class Place:
-        """A node with its ``number`` in its level, the level's ``shape``, the nodes of finer levels (``start``), the
-        level's nodes in all scenes (``all``), and its scene's first node."""
+        """A node of a level, with its ``number`` and the ``shape`` of the level."""
 
         start: int
         all: int
@@ -67,21 +67,15 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def entry(rows: int, row: int, number: int, at: Place) -> wp.int64:
-        """Return the index of a node's entry in one row of its level, in an array with ``rows`` rows a level."""
         return wp.int64(rows) * wp.int64(at.start) + wp.int64(row) * wp.int64(at.all) + wp.int64(number)
 
     @wp.func
     def entry_beside(rows: int, row: int, step: wp.vec3i, at: Place) -> wp.int64:
-        """Return the index of `entry` for the node a step away."""
         return entry(rows, row, at.first + number_of(at.here + step, at.shape), at)
 
     @wp.func
     def share(child: int, corner: int, halved: int) -> real:
-        """Return the hat function of a coarse cell's corner at a corner of one of its children, 0 to 1.
-
-        ``child`` and ``corner`` have a bit for each axis along which they are not on the coarse corner's side;
-        ``halved`` has a bit for each axis along which a coarse cell has two children.
-        """
+        """Return the interpolation weight from a corner of a coarse cell to a corner of a child cell."""
         if ((child | ~halved) & corner) != 0:
             return real(0.0)
         bits = (child | corner) & halved
@@ -89,7 +83,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def coarsen(fine: wp.vec3i, shape: wp.vec3i, factor: wp.vec3i, cells_fine: terms, cells: terms):
-        """Sum P^T M P over the matrices M of a coarse cell's children, with a thread for each corner of each cell."""
+        """Compute the matrix of a coarse cell from the matrices of its child cells."""
         a = wp.tid() // cells.shape[1]
         cell = wp.tid() - a * cells.shape[1]
         nodes = shape[0] * shape[1] * shape[2]
@@ -117,7 +111,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @typed.kernel(module)
     def fill(members: int, shapes, starts, cells, all_nodes: int, A):
-        """Write the symmetric matrices of all levels, with a thread for each node and half of its offsets."""
+        """Write the symmetric matrices of all levels."""
         offset = wp.tid() // all_nodes
         at = place_of(wp.tid() - offset * all_nodes, members, shapes, starts)
         step, total = step_of(offset), real(0.0)
@@ -132,7 +126,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @typed.kernel(module)
     def weigh(members: int, shapes, starts, A, weight):
-        """Compute w of each node of all levels, 0 where the matrix is 0."""
+        """Compute the Jacobi weights of the nodes of all levels."""
         at = place_of(wp.tid(), members, shapes, starts)
         own, total = A[entry(AROUND, AROUND // 2, at.number, at)], real(0.0)
         if own > real(0.0):
@@ -147,16 +141,16 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 def pairs_of_corners(dimension: int) -> int:
-    """Return the number of pairs of a cell's corners, including a corner with itself."""
+    """Return the number of pairs of corners of a cell. A corner also forms a pair with itself."""
     return 2**dimension * (2**dimension + 1) // 2
 
 
 class Level(NamedTuple):
     shape: wp.vec3i
     factor: wp.vec3i
-    """Ratio of the finer grid's number of nodes to this grid's, along each axis."""
+    """Ratio of the finer level's number of nodes to this level's, along each axis."""
     cells: wp.array
-    """(pairs, cells) terms of the cells of all scenes in the matrix, by pairs of corners"""
+    """Terms of all cells in the matrix (pairs of corners, cells)."""
 
 
 class Levels:
@@ -169,7 +163,8 @@ class Levels:
         device: Any,
         rows: int = 0,
     ):
-        """Allocate all levels below a finest grid of a ``shape``, to whose matrix B^T B with ``rows`` rows is added."""
+        """Allocate all levels of a grid with the given ``shape``. ``rows`` is the number of rows of the matrix `B` of
+        rigid bodies."""
         self._kernels, self._device = level_kernels(precision, dimension), device
         self._solve = solve_kernel(precision, dimension, device.is_cpu)
         factors: list[tuple[int, ...]] = [(1, 1, 1)]
@@ -189,11 +184,12 @@ class Levels:
             for n, factor, i, j in zip(shapes, factors, at[:-1], at[1:], strict=True)
         ]
         self.cells, self.r = self.levels[0].cells, residual[: counts[0]]
-        """(pairs, cells) terms of the finest grid's cells in the matrix, and (nodes,) the right-hand side"""
+        """Terms of the finest level's cells in the matrix (pairs of corners, cells), and the right-hand side
+        (nodes,)."""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
-        """(rows, nodes)"""
+        """Matrix of free bodies (rows, nodes)."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
-        """(members,) iterations of the last solve"""
+        """Number of iterations of the last solve in each scene (members,)."""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]
         blocks = -(-counts[0] // members // BLOCK)
         teams, team = members, 1
@@ -224,6 +220,6 @@ class Levels:
         context.launch(self._kernels.weigh, self._all, weight=self._weight, threads=len(self._weight))
 
     def solve(self, e: wp.array, tolerance: float, most: int) -> None:
-        """Write to ``e`` (nodes,) the solution of (A + B^T B) e = `r`, which is overwritten."""
+        """Solve for the coarse pressure ``e`` (nodes,) with the right-hand side `r`, which is overwritten."""
         limits = {"tolerance": tolerance, "most": most}
         launch(self._solve, self._threads, self._device, limits, system=self._system, e=e, block=BLOCK)

@@ -1,7 +1,7 @@
-"""Hat functions of a grid's nodes: their values at particles, and sums over the particles around nodes.
+"""Hat functions of the nodes of a grid, and sums over the particles around nodes.
 
-A node's hat phi is 1 at the node and falls linearly along each axis to 0 at the next nodes. The cells of the grid are
-those of a `CellSort`; node number k is at the lower corner of cell number k.
+The hat function of a node is 1 at the node and falls linearly along each axis to 0 at the next nodes. The grid is the
+grid of a `CellSort`. Node number k is at the lower corner of cell number k.
 """
 
 from functools import cache
@@ -19,8 +19,7 @@ ALONE = 0.01
 
 @cache
 def node_functions(dimension: int) -> SimpleNamespace:
-    """Make Warp functions that number the nodes of a periodic grid. ``beside`` returns a node's number over all scenes,
-    ``pair_of`` the number of two corners of a cell in any order."""
+    """Make Warp functions that number the nodes of a periodic grid and the pairs of corners of a cell."""
     flat, CORNERS = wp.constant(dimension == 2), wp.constant(2**dimension)
 
     @wp.func
@@ -63,9 +62,8 @@ def node_functions(dimension: int) -> SimpleNamespace:
 
 @cache
 def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make Warp functions of the hats of nodes. ``at`` returns the sum E of node values e at a particle, its gradient G
-    and its mixed second derivatives H. ``products`` sums e u over the nodes around a particle, ``bend`` is H v, and
-    ``held`` is eps + h^2 / 100."""
+    """Make Warp functions of the hat functions. ``at`` interpolates node values at a particle. ``products`` sums
+    products over the nodes around a particle. ``bend`` multiplies mixed second derivatives by a vector."""
     real, vector = precision.real, precision.vector
     grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
     number_of, corner_step = node_functions(dimension).number_of, node_functions(dimension).corner_step
@@ -75,7 +73,7 @@ def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.struct
     class Hat:
-        """phi, its gradient and its mixed second derivatives yz, xz and xy."""
+        """A hat function at a point: its value, its gradient and its mixed second derivatives yz, xz and xy."""
 
         value: real
         slope: vector
@@ -135,7 +133,7 @@ def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def bend(bent: vector, v: vector) -> vector:
-        """Return H v for mixed second derivatives yz, xz and xy."""
+        """Return the product of a symmetric matrix with zero diagonal and a vector."""
         return vector(bent[2] * v[1] + bent[1] * v[2], bent[2] * v[0] + bent[0] * v[2], bent[1] * v[0] + bent[0] * v[1])
 
     @wp.func
@@ -147,8 +145,7 @@ def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def node_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make kernels that sum over the particles around nodes. ``add_up`` computes terms in A by pairs of a cell's
-    corners, ``spread`` terms in a sum by corners, and ``gather`` the sums at nodes."""
+    """Make kernels that sum over the particles around nodes, for the matrix and for the right-hand side."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, own = cell_grid_type(precision), hat_functions(precision, dimension)
     source = bundle(s_value=real, s_slope=vector, s_bent=vector, s_own=real)

@@ -56,9 +56,8 @@ from cortado.sph.parts import StepContext
 
 @cache
 def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the kernels of the pressure change d by a coarse pressure e. The kernels ``source_tangent`` and
-    ``correct_adjoint`` compute the sources that are spread to nodes for the tangent and the adjoint of e;
-    ``source_adjoint`` starts from lambda, the solution of A lambda = adjoint of e."""
+    """Make the kernels of the coarse pressure's right-hand side and of the pressure change, with tangent and
+    adjoint."""
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
     at, products, bend, held, alone = hats.at, hats.products, hats.bend, hats.held, wp.constant(real(2.0 * ALONE))
@@ -72,7 +71,7 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
 
     @particle_kernel(module, "change T", numbers=numbers, typed=typed)
     def correct(i: int, grid, particles: int, x_i, L_i: matrix, coarse_i, weights_i, y_i, e) -> tuple[real, six]:
-        """Return the clamped change d of the pressure y by e, and T = d L."""
+        """Return the change of a particle's pressure, and the change times the gradient correction matrix."""
         z, least = y_i + coarse_i * at(i, particles, x_i, e, grid).value, wp.min(y_i, real(0.0))
         new = z
         if z < least:
@@ -145,20 +144,20 @@ def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNames
 
 
 SMALL = 1e-6
-"""Speed, in spacings per step, whose kinetic energy is added to the sums of alpha."""
+"""Speed for the regularisation of the step length [spacings per time step]."""
 
 
 @cache
 def length_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of alpha, given d, the thrust -D^T d / m, and the G d of free bodies as ``carried``. ``share``
-    computes terms in both sums of alpha, ``apply`` k', y' and u' from these sums."""
+    """Make the kernels of the step length. ``share`` computes each particle's terms of two sums. ``apply`` computes the
+    new pressures and velocities."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     small, typed = wp.constant(real(SMALL)), types_by_name(precision, {int: "first stays"})
     modules = [kernel_module(f"coarse_length_{precision.name}")] * 3
 
     @wp.func
     def length(sums: pair_of) -> real:
-        """Return alpha from both sums; NaN stays NaN, so that it is not hidden."""
+        """Return the step length from two sums. NaN stays NaN."""
         found = sums[0] / sums[1]
         return wp.where(found <= real(0.0), real(0.0), wp.where(found >= real(1.0), real(1.0), found))
 
@@ -171,7 +170,7 @@ def length_kernels(precision: Precision) -> SimpleNamespace:
 
     @typed
     def share(first, spacing, stays, time_step, m_i, r_i, change_i, carried_i, thrust_i) -> pair_of:
-        """Return a particle's terms in both sums of alpha; in a scene that ``stays`` uncorrected alpha is 0."""
+        """Return the terms of a particle in the two sums of the step length."""
         if stays != 0:
             return pair_of(real(0.0), m_i)
         v = small * spacing / time_step
@@ -196,8 +195,7 @@ def length_kernels(precision: Precision) -> SimpleNamespace:
 
 @cache
 def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the kernels of free bodies on the coarse grid. ``gather`` writes a body's rows of B, and ``lift`` computes
-    ``factor`` c E of particles. The source kernels have the terms of c G c E in the tangent and the adjoint of e."""
+    """Make the kernels of free bodies on the coarse grid."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
     hat, at, beside, corner_step = hats.hat, hats.at, among.beside, among.corner_step
@@ -212,7 +210,8 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
         grid, order, first: int, density, volume: real, inertia: matrix, half: matrix, hold, turns, x,
         of: bundle(coarse=real, gamma_of=vector, arm=vector), B: wp.array2d(dtype=real),
     ):  # fmt: skip
-        """Write a body's rows of B from row ``first`` on; ``half`` is a square root of I^-1."""
+        """Write a body's rows of the matrix ``B``, starting at row ``first``. ``half`` is a square root of the inverse
+        inertia."""
         node, force, torque = wp.tid(), vector(), vector()
         member = node // (grid.shape[0] * grid.shape[1] * grid.shape[2])
         for corner in range(CORNERS):
@@ -255,7 +254,6 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
     def source_adjoint(
         i: int, grid, particles: int, x_i, coarse_i, e, multiplier, carried_i, lifted_bar_i
     ) -> tuple[real, vector]:
-        """Add to the adjoints of c and x; ``multiplier`` is lambda, and ``carried`` G c E."""
         f, g = at(i, particles, x_i, e, grid), at(i, particles, x_i, multiplier, grid)
         slope = lifted_bar_i * f.slope - carried_i * g.slope
         return lifted_bar_i * f.value - carried_i * g.value, coarse_i * slope
@@ -264,7 +262,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
 
 
 class CoarseBodies:
-    """The free bodies' rows of B, and their operator G."""
+    """The rows of free bodies in the coarse matrix."""
 
     def __init__(self, bodies: Bodies, layout: Layout, dimension: int):
         precision, matrix = layout.precision, layout.precision.matrix
@@ -280,12 +278,12 @@ class CoarseBodies:
             context.launch(self.kernels.gather, grid, own, *bodies, known, B=B, threads=B.shape[1])
 
     def carried(self, context: StepContext, y: wp.array) -> wp.array:
-        """Return G y, the divergence that pressures y remove by moving bodies; the next call overwrites it."""
+        """Return the divergence that pressures ``y`` remove by moving rigid bodies. The next call overwrites the
+        result."""
         return self.bodies.drifted(context, self._none, y)
 
 
 def _root(inertia: np.ndarray) -> np.ndarray:
-    """Return the square root S of I^-1, with 0 for turns about axes without inertia."""
     values, axes = np.linalg.eigh(np.linalg.pinv(inertia))
     found: np.ndarray = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T
     return found
@@ -303,7 +301,6 @@ class CoarseBodiesTangent:
         return {"carried": carried, "carried_dot": change}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], source: Named) -> None:
-        """Add the tangent of c G c E to the source of the tangent of e."""
         kernels, lifted = self._own.kernels, self._lifted
         context.launch(kernels.lift, *known, lifted, factor=1.0)
         context.launch(kernels.lift_tangent, *known, lifted)
@@ -321,7 +318,7 @@ class CoarseBodiesAdjoint:
         self._bodies.carried(context, carried_bar, y, y_bar)
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
-        """Add the adjoints of -lambda . c G c E, with the ``multiplier`` lambda, to those of all inputs."""
+        """Add the terms of rigid bodies to the adjoints. ``multiplier`` is the solution of the adjoint system."""
         kernels, (lifted, lifted_bar, carried_bar) = self._own.kernels, self._lifted.values()
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)

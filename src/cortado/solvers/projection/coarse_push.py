@@ -1,14 +1,15 @@
-"""The force of a smooth pressure on the coarse grid on a particle, and the divergence that this pressure has to remove.
+"""The force of a smooth coarse pressure on a particle, and the divergence that this pressure has to remove.
 
-The push h is the force of a constant pressure c, and the moment N that of a pressure's gradient. For a pressure k_j =
-c_j phi(x_j) with a linear function phi, and T = c L, D^T k of `cortado.solvers.projection.pressure` is exactly
+The push h is the force of a constant pressure c, and the moment N is the force of a pressure's gradient. For a pressure
+k_j = c_j phi(x_j) with a linear function phi, and T = c L, the force D^T k of `cortado.solvers.projection.pressure` is
+exactly
 
     (D^T k)_i = N_i grad phi + phi(x_i) h_i,
     N_i = -sum_j (T_j g_ij) x_ij^T - sum_j' eta_j c_j g_ij' x_ij^T,
     h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij',
 
-with the images j' of particles j, whose weight eta is h in `cortado.solvers.projection.effects`. Inside of the fluid
-and beside mirrors N is the unit matrix and h is 0, but not beside wall particles.
+with the images j' of particles j, whose weight eta is h in `cortado.solvers.projection.effects`. Inside the fluid and
+beside mirroring walls N is the unit matrix and h is 0, but not beside wall particles.
 """
 
 from functools import cache
@@ -29,9 +30,7 @@ from cortado.sph.moment_functions import cross_terms_function, moment_functions,
 
 @cache
 def coarse_sums(discretisation: Discretisation) -> Kernels:
-    """Make the sums over neighbours of the coarse push: for T = c L, sum T_j g_ij, which is h without T_i g_i and c_i
-    gamma_i, and the rows of N. The adjoint turns adjoints of h and N into that of x and the symmetric part of that of
-    T, as diagonal and other entries."""
+    """Make the sums over neighbours for the push and the moment of a coarse pressure."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
@@ -64,8 +63,7 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_image_sums(discretisation: Discretisation) -> Kernels:
-    """Make the images' terms in h and in the rows of N. The adjoint turns adjoints of h and N into those of eta_i c_i
-    and x."""
+    """Make the terms of mirror images in the push and the moment of a coarse pressure."""
     (real, vector, _), pair = discretisation.types, pair_functions(discretisation)
     gradient, hessian_product, typed = pair.gradient, pair.hessian_product, types_by_name(discretisation.precision)
 
@@ -91,7 +89,6 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
     def push_back(
         x_ij, direct, coarse_i, coarse_j, image_i, image_j, h_bar_i, h_bar_j, N_bar_i, N_bar_j, s
     ) -> tuple[real, vector]:
-        """Return the adjoints of eta_i c_i and x_i; those of the neighbour's h and N are turned as its image is."""
         g, q, p = s.volume * gradient(x_ij, s), image_i * coarse_i, image_j * coarse_j
         from_i, from_j = h_bar_i - N_bar_i * direct, h_bar_j + N_bar_j * direct
         pulled = q * (h_bar_i - from_j) + p * (from_i - h_bar_j)
@@ -104,7 +101,7 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of h and N, the force of a coarse pressure on particles."""
+    """Make the kernels of the push and the moment of a coarse pressure."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = coarse_sums(discretisation), coarse_image_sums(discretisation), symmetric(precision)
@@ -158,14 +155,12 @@ def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 CALM = 1e-6
-"""Bound q on the divergence times the time step: r excludes tension beyond q and includes compression beyond q, with a
-smoothstep between. The smoothstep prevents a kink where fluid at rest is released, whose divergence is round-off."""
+"""Width of the smooth transition between tension and compression [-]."""
 
 
 @cache
 def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of r, the divergence that a coarse pressure has to remove. The adjoint turns that of r into
-    d_bar, the adjoint of D u, and S = d_bar L."""
+    """Make the kernels of the divergence that a coarse pressure has to remove."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     sums = projection_sums(discretisation)
@@ -178,7 +173,6 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 
     @wp.func
     def counts(y: real, tension: real, q: real):
-        """Return the share S of a divergence q, times the time step, in the coarse residual, and q dS/dq."""
         if y > real(0.0) or tension >= one:
             return one, real(0.0)
         t = wp.clamp(real(0.5) + q / width, real(0.0), one)
@@ -190,7 +184,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     def residual(
         row_x, row_y, row_z, widened, time_step, n_i, L_i, gamma_i, drift_i, weights_i, image_i, coarse_i, u_i, y_i
     ) -> tuple[matrix, real, real, real, vector, vector, real]:
-        """Return A, the divergence, the residual r and the source c r."""
+        """Return the velocity gradient sums, the divergence, the residual, and the particle's terms of the right-hand
+        side."""
         A = wp.matrix_from_rows(row_x, row_y, row_z)
         D = wp.ddot(L_i, A) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
         left = D - wanted(n_i, weights_i[1], time_step)

@@ -1,10 +1,11 @@
-"""Solves (A + B^T B) e = r on the coarse grid in one launch, by conjugate gradients (Hestenes and Stiefel 1952) with a
-V-cycle over the grids of `cortado.solvers.projection.coarse_levels`. The V-cycle uses A alone, without B^T B: each of
-the few rows of B costs at most one more iteration.
+"""Solves the equations of the coarse pressure in one kernel launch.
 
-One text of C++ serves both devices. On a CPU a thread solves for a scene. On a GPU a team of blocks solves for a scene;
-blocks wait for one another between phases, and a team's first block processes levels with few nodes. Sums have the same
-bits for any size of a team, because they are made of partial sums over `BLOCK` nodes.
+The method is conjugate gradients (Hestenes and Stiefel 1952) with a multigrid cycle as preconditioner
+(`cortado.solvers.projection.coarse_levels`). The multigrid cycle leaves rigid bodies out.
+
+CPUs and GPUs run the same C++ source. On a CPU, one thread solves for a scene. On a GPU, a team of blocks solves for a
+scene, and blocks wait for each other at barriers. Results do not depend on the number of blocks, because sums are made
+of partial sums over `BLOCK` nodes.
 """
 
 from functools import cache
@@ -16,9 +17,9 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 BLOCK = 512
-"""Threads of a block on a GPU."""
+"""Number of threads in a GPU block."""
 ALONE = 4 * BLOCK
-"""Greatest number of nodes of a level that one block processes alone."""
+"""Greatest number of nodes of a level for a single block."""
 
 ON_A_CPU = """
     const int first = thread, teams = system.members;
@@ -31,9 +32,7 @@ ON_A_CPU = """
         return T(total);
     };
 """
-"""The names that `SOLVE` uses, on a CPU. A thread solves the scenes ``first``, ``first + teams`` and so on; the thread
-with ``lead`` writes the count; ``each`` and ``sum`` loop over nodes. After the barrier ``meet`` a thread sees what
-others wrote."""
+"""C++ definitions for `SOLVE` on a CPU."""
 ON_A_GPU = """
     __shared__ T room[BLOCK];
     const int first = blockIdx.x / system.team, teams = gridDim.x / system.team, rank = blockIdx.x % system.team;
@@ -210,42 +209,40 @@ SOLVE = """
         if (lead) system.count.data[member] = done;
     }
 """
-"""Native code of a solve, one scene after the other. Iterations end when r . z, with the V-cycle's approximate solution
-z of A z = r, has fallen by the square of a tolerance. Nodes where the matrix is 0 have the result 0."""
+"""C++ code of a solve. Nodes without matrix entries get the result 0."""
 
 
 @cache
 def system_type(precision: Precision) -> Any:
-    """Make the struct of a solve's system: matrices and work arrays of all levels, concatenated, each with the nodes of
-    all scenes."""
+    """Make the Warp struct of the equations: matrices and work arrays of all levels, one level after the other."""
     numbers = wp.array(dtype=precision.real)
 
     @wp.struct
     class System:
         shapes: wp.array(dtype=wp.int32)
-        """Six numbers for each level: the numbers of nodes along the axes, and the ratios of the finer grid's numbers
-        to these."""
+        """Six numbers for each level: numbers of nodes along the axes, and ratios to the finer level's numbers of
+        nodes."""
         starts: wp.array(dtype=wp.int64)
         members: wp.int32
         team: wp.int32
         A: numbers
         weight: numbers
-        """w of nodes (`cortado.solvers.projection.coarse_levels`)"""
+        """Jacobi weights of nodes."""
         residual: numbers
         x_values: numbers
         z_values: numbers
         direction: numbers
-        """p of conjugate gradients, on the finest grid."""
+        """Search direction of conjugate gradients."""
         image: numbers
-        """(A + B^T B) p"""
+        """Product of the matrix and the search direction."""
         rows: wp.int32
         B: numbers
-        """The rows of B, one after the other, each with the nodes of all scenes."""
+        """Rows of the matrix of rigid bodies, one after the other."""
         partial: numbers
         gate: wp.array(dtype=wp.int32)
-        """Number of blocks that wait at a barrier, and number of barriers passed, for each team."""
+        """Number of waiting blocks and number of passed barriers, for each team."""
         count: wp.array(dtype=wp.int32)
-        """(members,) iterations of the last solve"""
+        """Number of iterations of the last solve in each scene (members,)."""
 
     return System
 

@@ -1,10 +1,12 @@
-"""Weights and gradient corrections of a particle in the projection, computed from the moments of its neighbours; and
-images of the fluid in flat mirroring walls, in place of wall particles (`cortado.particles.neighbourhood`).
+"""Weights and gradient corrections of a particle in the projection, and images of the fluid in flat mirroring walls.
 
-M, Q and g are the moments of `cortado.solvers.projection.sums`, gamma and nu those of
-`cortado.solvers.projection.wall_sums`, and H is the fullness of `cortado.sph.moment_functions`. S(a, b) is a smoothstep
-of H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is near 0 beside walls; nu_m is the part of nu by mirroring
-walls, and q is near 0 beside other walls. The projection uses:
+Weights and corrections are computed from the moments of the particle's neighbours. Images replace wall particles
+(`cortado.particles.neighbourhood`).
+
+M, Q and g are the moments of `cortado.solvers.projection.sums`, and gamma and nu are the sums of
+`cortado.solvers.projection.wall_sums`. H is the fullness of `cortado.sph.moment_functions`, and S(a, b) is a smoothstep
+of H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is near 0 beside walls. Here nu_m is the part of nu by
+mirroring walls, and q is near 0 beside other walls. The projection uses:
 
     sigma = S(0.1, 0.5) B    the part of tension that is admitted; 1 in a shut scene (see `pressure`),
     f = S(0.1, 0.5) of H + nu   the part of the previous step's pressure with which a step begins,
@@ -18,15 +20,15 @@ walls, and q is near 0 beside other walls. The projection uses:
     t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m,   the diagonal of the projection's matrix.
 
-If a wave stretches rows of fluid beside a wall, so that they no longer match the rows of wall particles, the divergence
-D takes the fluid for compressed, which damps waves and stirs still water. A mirror suits any rows, so images have the
-weight h, and particles of mirroring walls the weight 1 - h, with
+A wave stretches the layers of fluid beside a wall, so that they no longer match the layers of wall particles. The
+divergence D then mistakes the fluid for compressed, which damps waves and stirs still water. A mirror suits any layers.
+Images therefore have the weight h, and particles of mirroring walls the weight 1 - h, with
 
     h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4),
 
-a smoothstep of the ratio of the images' part of the number density to nu_m, the walls' part. h is 1 if the fluid beside
-a wall is as dense as the wall expects, and 0 in spray and beside solids, which walls do not mirror. With g_i' = V grad
-W of the separation from an image x_j' = R x_j + o, images add
+a smoothstep of the ratio of the images' part of the number density to the walls' part nu_m. h is 1 if the fluid beside
+a wall is as dense as the wall expects. It is 0 in spray and beside solids, which walls do not mirror. With g_i' = V
+grad W of the separation from an image x_j' = R x_j + o, images add
 
     h_i sum (v_i - R v_j) . g_i'                   to the divergence,
     sum (h_i k_i + h_j k_j) g_i'                   to its transpose, the force,
@@ -49,30 +51,29 @@ from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_b
 from cortado.sph.moment_functions import moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
-"""Fullness below which a weight is 0, and above which the weight is 1."""
+"""Fullness at which each weight begins to grow from 0, and fullness at which it reaches 1."""
 SHARED = (0.7, 0.95)
-"""H + 2 nu below which c is 0, and above which c is 1."""
+"""Fullness at which the weight of the coarse pressure begins to grow from 0, and fullness at which it reaches 1."""
 WALLED = 0.05
-"""nu at which the weights of tension, correction and repair of low densities are halved."""
+"""Wall coverage that halves the weights of tension, gradient correction and repairs."""
 APART = 0.005
-"""nu of walls without mirror at which q is 1/2; mirrors do not mirror these walls, so images must vanish beside
-them."""
+"""Coverage by walls without mirror images that halves the weight of images."""
 MIRRORED = 9.0
-"""Additional weight of mirroring walls in B. Images fill the neighbourhood beside such walls, so K must not correct a
-second time, and tension must not hold a falling block to its image."""
+"""Additional weight of mirroring walls in the wall coverage."""
 REGULAR = 0.05
-"""Number added to the diagonal of M before M is inverted."""
+"""Regularisation of the moment matrix before its inversion."""
 NEWTON = 0.033
-"""Two thirds of a Newton step towards the inverse of M, J + J (I - M J) = J + 0.05 J (J - I). Without the step films on
-a gentle slope are too slow; with a full step water at rest moves faster."""
+"""Factor of a Newton step towards the inverse of the moment matrix. A full step would make water at rest move
+faster."""
 ALONG = 0.2
-"""Part of the missing gradient along a wall that is corrected. With 0, water at rest sinks along upright walls in a
-lasting vortex; with 1, the second row rises."""
+"""Corrected fraction of the missing gradient along a wall. With 0, water at rest sinks along upright walls. With 1, the
+second layer of particles rises."""
 
 
 @cache
 def away_function(precision: Precision) -> Any:
-    """Make the Warp function 1 / (1 + (nu / half)^4) of nu and half, which is near 0 beside walls."""
+    """Make the Warp function of a weight that is 1 away from walls and near 0 beside walls. ``half`` is the wall
+    coverage for the weight one half."""
     real = precision.real
 
     @wp.func
@@ -85,9 +86,7 @@ def away_function(precision: Precision) -> Any:
 
 @cache
 def effect_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
-    """Make Warp functions of one particle for L, a, c and the weights; ``behind`` is nu of mirroring walls, and
-    ``least`` is 0.05 a_0. ``back`` turns adjoints of L, a, weights and c into those of M, Q, g, gamma, nu, gamma and nu
-    of mirroring walls, and m."""
+    """Make Warp functions of a particle's gradient correction, diagonal and weights, with derivatives."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
@@ -118,7 +117,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Simpl
 
     @wp.func
     def walled_correction(M: matrix, gamma: vector, least: real) -> matrix:
-        """Return t P - (1 + t) C; M_zz = 1 in the plane has no effect."""
+        """Return the gradient correction beside a wall."""
         N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
         across = M * N - N * M * N
         P, whole = unit() - N, real(1.0) + regular
@@ -136,7 +135,6 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Simpl
 
     @wp.func
     def diagonal(L: matrix, Q: matrix, g: vector, gamma: vector, m: real, least: real) -> real:
-        """Return a, where tr(L Q L) = (L L) : Q as L and Q are symmetric."""
         own_part = L * g + gamma
         return (wp.dot(own_part, own_part) + least) / m + wp.ddot(L * L, Q)
 
@@ -164,24 +162,24 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Simpl
 
 
 EVEN = (0.7, 0.9)
-"""Ratio of the images' part of the density to the wall particles' part, below which h is 0 and above which h is 1. With
-0.5 and 0.8, spray thrown at a wall in long steps passes through it."""
+"""Ratios of the density of images to the density of wall particles. The weight of images is 0 below the first ratio and
+1 above the second."""
 LEAST = 1e-6
-"""Wall coverage nu below which no wall is within reach."""
+"""Smallest wall coverage that counts."""
 
 
 @cache
 def image_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the sums over images of the fluid in flat walls, and over mirroring walls.
+    """Make the sums over mirror images of the fluid in flat walls, and over the particles of mirroring walls.
 
-    - ``weights``: sum V W_i'
-    - ``lift``: sum (h_i y_i + h_j y_j) g_i'. The adjoint turns adjoints f into sum g_i' . (f_i - R f_j) and that of x.
-    - ``echo``: sum (c_i + c_j) g_i'
-    - ``spread``: sum (u_i - R u_j) . g_i'
-    - ``sweep``: sum g_i' . swept, where solids move
-    - ``walls``: over mirroring walls, the sums along normals, of nu, and of the drift
-    - ``behind``: nu of mirroring walls; the adjoint is its gradient
-    - ``mirror_of``: the number of the walls that mirror about a position
+    - ``weights``: density of images
+    - ``lift``: force of pressures
+    - ``echo``: adjoint of the density of images
+    - ``spread``: divergence of velocities
+    - ``sweep``: divergence by moving solids
+    - ``walls``: sums over mirroring walls
+    - ``behind``: coverage by mirroring walls
+    - ``mirror_of``: number of the walls that mirror about a position
     """
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
@@ -251,7 +249,6 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
 
     @mirror_sum(discretisation, typed)
     def mirror_walls_back(x_ij, v_j, mirror_bar_i, behind_bar_i, sweep_bar_i, foot, mirrors: int, s) -> vector:
-        """Return the adjoint of x; the adjoint of the drift is -``sweep_bar``."""
         bent = hessian_product(x_ij, normal(mirror_bar_i - sweep_bar_i * v_j, foot), s)
         return s.volume * (bent + behind_bar_i * gradient(x_ij, s))
 
@@ -281,8 +278,7 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def image_share(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """Make Warp functions of the weight h of images, and of its derivatives, from the parts of the density and the nu
-    of walls."""
+    """Make Warp functions of the weight of images and of its derivatives."""
     real, smoothstep = precision.real, moment_functions(precision, dimension).smoothstep
     away = away_function(precision)
     first, last, least, apart = (wp.constant(real(value)) for value in (*EVEN, LEAST, APART))

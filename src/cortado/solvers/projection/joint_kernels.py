@@ -1,21 +1,21 @@
 """Hinges between free bodies and other solids in a step of the projection, with derivatives.
 
-A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a, so its arm from A's
-middle is R a at the start of a step, and R' a at the predicted pose of A. The velocity changes V - V_0 and W - W_0
-(`cortado.sph.free_solids`), whatever their cause, must satisfy at the end of the step
+A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a. The vector from A's
+middle to the point is then R a at the start of a step, and R' a at the predicted pose of A. At the end of the step, the
+velocity changes V - V_0 and angular velocity changes W - W_0 (`cortado.sph.free_solids`) must satisfy
 
     b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0,
 
-where p' = c' + R' a is the predicted place of each point. For this A gets the momentum lambda at R_A a_A, and B gets
--lambda, so momentum and angular momentum are conserved. The remaining gap is of the order of dt^4, and the next step
-removes it. In space a hinge with the axis n also keeps two of the three angles: with P = I - n n^T A gets the angular
-momentum P lambda, B the opposite, and
+where p' = c' + R' a is the predicted place of each point. To this end A gets the momentum lambda at R_A a_A, and B gets
+-lambda, so that momentum and angular momentum are conserved. The remaining gap is of the order of dt^4, and the next
+step removes it. In 3-D a hinge with the axis n also keeps two of the three angles. With P = I - n n^T, A gets the
+angular momentum P lambda, and B the opposite, so that
 
     b = P ((W - W_0)_A - (W - W_0)_B) + n x (n'_A - n'_B) / dt = 0.
 
-Each of these equations is a row, and rows with the same body are coupled: b is b_0 + K lambda with 3 x 3 blocks K_kl,
-and a step solves K lambda = - b_0 once for each pressure by block elimination. A solid with a prescribed motion gets no
-momentum. Only the approximate coarse grid treats bodies as free of hinges.
+Each of these vector equations is a block row of a linear system, and rows with the same body are coupled: b is b_0 + K
+lambda with 3 x 3 blocks K_kl. A step solves K lambda = -b_0 once for each pressure by block elimination. A solid with a
+prescribed motion gets no momentum. Only the approximate coarse grid treats bodies as free of hinges.
 """
 
 from collections.abc import Sequence
@@ -32,18 +32,15 @@ from cortado.sph.moving_solids import hold_functions
 
 POSES = ("turns_before", "after", "turns")
 ROW = ("give", "take", "other_give", "other_take", "apart")
-"""Arrays of a row, see `joint_kernels`."""
 
 
 @cache
 def joint_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of hinges, with a thread for each scene.
 
-    ``point`` and ``lean`` compute four matrices of a row, and its gap over the time step. ``give`` maps lambda to its
-    moment on a body, and ``take`` maps a body's W - W_0 to its term in b. ``weigh`` adds a body's term to a block of K,
-    ``read`` computes b from velocities, and ``push`` adds the effect of lambda to velocities. ``factor`` eliminates,
-    ``solve`` computes lambda = -K^-1 b, also with the transpose of K, ``lengthen`` adds K' lambda to a tangent of b,
-    and ``spread`` adds to the adjoint of K.
+    ``point`` and ``lean`` compute the matrices and the gap of an equation. ``weigh`` adds the term of a body to a block
+    of the system. ``read`` computes the right-hand side from velocities. ``factor`` and ``solve`` solve the system.
+    ``push`` adds the effect of the momenta to velocities.
     """
     real, vector, matrix, holds = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, held = holds.spin, holds.kind
@@ -89,12 +86,12 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def turned(R: matrix, inertia: matrix, inverse: matrix, P: vector, T: vector, hold: held) -> vector:
-        """Return the change of W by a momentum and its moment, for a density of 1."""
+        """Return the change of a body's angular velocity by a momentum ``P`` and an angular momentum ``T``."""
         return spin(R, inertia, inverse, T - wp.cross(R * hold.arm, P), hold)
 
     @wp.func
     def gone(R: matrix, P: vector, W: vector, volume: real, hold: held) -> vector:
-        """Return the change of V by a momentum, with that of W, for a density of 1."""
+        """Return the change of a body's velocity by a momentum ``P``. ``W`` is the change of its angular velocity."""
         return wp.cw_mul(hold.moving, P) / volume - wp.cross(W, R * hold.arm)
 
     @wp.func
@@ -155,7 +152,6 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def factor_of(i: int, j: int, rows: int, transposed: int, factors: wp.array2d(dtype=matrix), b: int) -> matrix:
-        """Return the factor in row i and column j, or that of the transpose."""
         if transposed == 1:
             return wp.transpose(factors[j * rows + i, b])
         return factors[i * rows + j, b]

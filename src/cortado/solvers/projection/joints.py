@@ -1,4 +1,4 @@
-"""Hinges of a step of the projection, with derivatives: see `cortado.solvers.projection.joint_kernels`."""
+"""Hinges in a step of the projection, with derivatives; see `cortado.solvers.projection.joint_kernels`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,23 +17,22 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 Arrays = dict[str, wp.array]
 GUARD = {"float32": 1e-5, "float64": 1e-10}
-"""Part of its trace added to each diagonal block of K, which makes lambda 0 along directions in which neither body can
-move. Along the axis of a hinge, where K of the angles is 0, the whole trace is added."""
+"""Regularisation of the matrix of hinges, relative to the trace of each diagonal block."""
 BARS = ("turned_before_bar", "after_bar", "turned_bar")
 
 
 @dataclass(frozen=True)
 class Pair:
-    """A row and a column of K that a body couples."""
+    """Two equations that a body couples, as row and column of the matrix."""
 
     block: tuple[int, int]
     body: int
     far: tuple[bool, bool]
-    """For row and column, True if the body is the hinge's second solid."""
+    """True if the body is the second solid of the hinge, for row and column."""
 
 
 class JointArrays:
-    """Arrays of the hinges in a step, or tangents or adjoints with names that end in ``suffix``."""
+    """Arrays of the hinges in a step. ``suffix`` selects tangents or adjoints."""
 
     def __init__(self, rows: int, layout: Layout, suffix: str = ""):
         matrix, vector, self._suffix = layout.precision.matrix, layout.precision.vector, suffix
@@ -44,19 +43,19 @@ class JointArrays:
         self.whole = zeros(
             {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}, layout.device
         )
-        """K, b and lambda of all rows (`cortado.solvers.projection.joint_kernels`)."""
+        """Matrix, right-hand side and momenta of all equations."""
         blocks, wanted, pushes = self.whole.values()
         self.entries = [{f"wanted{suffix}": wanted[k], f"push{suffix}": pushes[k]} for k in range(rows)]
-        """For each row its b, ``wanted``, and its lambda, ``push``."""
+        """Right-hand side ``wanted`` and momentum ``push`` of each equation."""
         self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:
-        """Return the matrices ``give`` and ``take`` of a row for the hinge's first or second body."""
+        """Return two matrices of equation ``k`` for the first solid of the hinge, or for the second solid if ``other``
+        is true."""
         way = "other_" if other else ""
         return {f"{name}{self._suffix}": self.rows[k][f"{way}{name}{self._suffix}"] for name in ("give", "take")}
 
     def sides(self, pair: Pair) -> Arrays:
-        """Return ``take`` of the row and ``give`` of the column of a pair."""
         give, take = f"give{self._suffix}", f"take{self._suffix}"
         row, column = (self.side(k, far) for k, far in zip(pair.block, pair.far, strict=True))
         return {take: row[take], give: column[give]}
@@ -69,11 +68,11 @@ class JointArrays:
 
 @dataclass(frozen=True)
 class Row:
-    """Three equations of a hinge."""
+    """A vector equation of a hinge."""
 
     joint: Joint
     straight: bool
-    """True for the row that keeps the axis, False for the row that keeps the point."""
+    """True for the equation of the hinge's axis, False for the equation of its point."""
 
     @property
     def place(self) -> str:
@@ -81,18 +80,16 @@ class Row:
 
     @property
     def share(self) -> float:
-        """Return 1 if lambda is a momentum, 0 if lambda is an angular momentum."""
+        """Return 1 for the equation of the hinge's point, 0 for the equation of its axis."""
         return 0.0 if self.straight else 1.0
 
     @property
     def sides(self) -> list[tuple[int, bool]]:
-        """Return the numbers of the row's free bodies, each with True for the hinge's second solid."""
+        """Return the numbers of the equation's free bodies, each with True for the second solid of the hinge."""
         return [(body, other) for body, other in ((self.joint.body, False), (self.joint.other, True)) if body >= 0]
 
 
 class Joints:
-    """The hinges of one solver."""
-
     def __init__(self, part: FreeSolidsPart, joints: Sequence[Joint], layout: Layout):
         self.part, self.layout = part, layout
         space = part.made_of.dimension == 3
@@ -117,7 +114,6 @@ class Joints:
 
     @cached_property
     def kernels(self) -> SimpleNamespace:
-        """Make the kernels on first use, because scenes without hinges need none."""
         return joint_kernels(self.layout.precision)
 
     def number(self, row: Row) -> int:
@@ -127,8 +123,7 @@ class Joints:
         return self.part.bodies[body].table.weight
 
     def frames(self, step: StepContext) -> Iterator[tuple[int, Row, Any, tuple[Named, ...]]]:
-        """Yield each row with its number, the kernels of its matrices, and their arguments: the place, and the poses of
-        both solids, with tangents, and at the start of the run."""
+        """Yield the number of each equation, the equation, its kernels, and their arguments."""
         vector, each = self.layout.precision.vector, self.part.made_of.walls.each
         for k, row in enumerate(self.rows):
             joint = row.joint
@@ -141,7 +136,7 @@ class Joints:
             yield k, row, self.kernels.lean if row.straight else self.kernels.point, (self.own.rows[k], known, named)
 
     def weighed(self, step: StepContext) -> Iterator[tuple[Pair, tuple[Named, ...]]]:
-        """Yield `pairs` with the arguments of `weigh`."""
+        """Yield `pairs` with the arguments of the kernel ``weigh``."""
         for pair in self.pairs:
             row, column = (self.rows[k] for k in pair.block)
             own = {"row_share": row.share, "share": column.share, "sign": 1.0 if pair.far[0] == pair.far[1] else -1.0}
@@ -151,13 +146,13 @@ class Joints:
             yield pair, (self.own.sides(pair), own, self.own.blocks[pair.block], *body)
 
     def read(self, moved: Sequence[Arrays]) -> Iterator[tuple[int, Row, tuple[Named, ...]]]:
-        """Yield the rows with the arguments of the kernel `read`, given velocities ``moved`` by `move_kernels`."""
+        """Yield the equations with the arguments of the kernel ``read``. ``moved`` are velocities of bodies."""
         for k, row in enumerate(self.rows):
             numbers = {"share": row.share, "is_free": row.joint.other >= 0}
             yield k, row, (velocities(row, moved), self.own.rows[k], self.own.entries[k], numbers)
 
     def ends(self, step: StepContext, moved: Sequence[Arrays]) -> Iterator[tuple[int, int, bool, tuple[Named, ...]]]:
-        """Yield row number, body number, whether the body is the hinge's second solid, and arguments of `push`."""
+        """Yield equation number, body number, True for the second solid of the hinge, and the arguments of ``push``."""
         for k, row in enumerate(self.rows):
             for body, other in row.sides:
                 signs, own = {"share": row.share, "sign": -1.0 if other else 1.0}, self.part.bodies[body].known(step)
@@ -174,13 +169,14 @@ class Joints:
             step.launch(self.kernels.factor, *factors, rows=len(self.rows), threads=self.layout.members)
 
     def solve(self, step: StepContext, wanted: wp.array, pushes: wp.array, transposed: int = 0) -> None:
-        """Write -K^-1 times ``wanted``; with ``transposed``, use the transpose of K."""
+        """Solve for the momenta ``pushes`` of hinges, given the right-hand side ``wanted``. ``transposed`` 1 selects
+        the transposed system."""
         known = {"rows": len(self.rows), "transposed": transposed, "wanted": wanted, "pushes": pushes}
         if self.rows:
             step.launch(self.kernels.solve, self.factors, known, threads=self.layout.members)
 
     def find(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Write lambda, given the velocities ``moved`` of bodies without hinges."""
+        """Compute the momenta of hinges. ``moved`` are the velocities of bodies without hinges."""
         for _, _, known in self.read(moved):
             step.launch(self.kernels.read.forward, *known, threads=self.layout.members)
         self.solve(step, self.own.whole["wanted"], self.own.whole["pushes"])
@@ -190,13 +186,13 @@ class Joints:
             step.launch(self.kernels.push.forward, *known, threads=self.layout.members)
 
     def join(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Replace velocities of bodies without hinges by velocities that satisfy the hinges."""
+        """Replace velocities of bodies without hinges by velocities with hinges."""
         self.find(step, moved)
         self.push(step, moved)
 
 
 def velocities(row: Row, moved: Sequence[Arrays], suffix: str = "") -> Arrays:
-    """Return the velocity changes of both bodies of a row, or tangents or adjoints, by argument names of `read`."""
+    """Return the velocity changes of an equation's two solids, by argument names of the kernel ``read``."""
     own = moved[row.joint.body]
     other = own if row.joint.other < 0 else moved[row.joint.other]
     names = [f"{name}{suffix}" for name in ("faster", "turned_faster")]
@@ -219,7 +215,7 @@ class JointsTangent:
             step.launch(of.kernels.weigh.tangent, *changes, *known, threads=members)
 
     def join(self, step: StepContext, moved: Sequence[Arrays], moved_dot: Sequence[Arrays]) -> None:
-        """Apply the tangent of `Joints.join`, which joins ``moved`` too."""
+        """Apply the tangent of `Joints.join`. It also updates ``moved``."""
         of, dots, members = self._joints, self._dots, self._joints.layout.members
         of.find(step, moved)
         for k, row, known in of.read(moved):
@@ -235,7 +231,7 @@ class JointsTangent:
 
 
 class JointsAdjoint:
-    """The adjoint of `Joints`, which adds to the adjoints of each body's turn in ``turned``."""
+    """The adjoint of `Joints`."""
 
     def __init__(self, joints: Joints, bar: Adjoints, turned: Sequence[Arrays]):
         self._joints, self._bar, self._turned = joints, bar, turned
@@ -247,8 +243,7 @@ class JointsAdjoint:
         self._bars.clear()
 
     def join(self, step: StepContext, moved: Sequence[Arrays], moved_bar: Sequence[Arrays]) -> None:
-        """Apply the adjoint of `Joints.join`: turn adjoints of joined velocities into those of the velocities
-        ``moved``."""
+        """Apply the adjoint of `Joints.join` to the adjoints of velocities, ``moved_bar``."""
         of, bars, members = self._joints, self._bars, self._joints.layout.members
         of.find(step, moved)
         bars.whole["pushes_bar"].zero_()

@@ -1,4 +1,4 @@
-"""Constants of the projection on the rest lattice, and the grid of its coarse correction, in float64 without Warp."""
+"""Constants of the projection on the rest lattice, and the grid of its coarse correction, in float64."""
 
 import itertools
 from dataclasses import dataclass
@@ -12,29 +12,25 @@ from cortado.scene.scene import Scene
 
 MARGIN = 1.05
 SMOOTHED = 1.0 / 3.0
-"""Part of the greatest stiffness above which density waves are repaired about equally fast."""
+"""Smallest relative stiffness of the density waves that repairs remove evenly."""
 DEPARTURE = 0.05
-"""Part of a_0 that is added to the diagonal, which is small for particles with few neighbours."""
+"""Regularisation of the diagonal of the pressure iteration, relative to its value on the lattice."""
 
 
 @dataclass(frozen=True)
 class ProjectionConstants:
     spacing: float
-    """[m]"""
     relaxation: float
-    """omega = 1 / (1.05 lambda) of the Jacobi iteration [-]."""
+    """Relaxation factor of the Jacobi iteration [-]."""
     least_diagonal: float
-    """[1 / m2], `DEPARTURE` times a_0 = sum_j |g_ij|^2."""
+    """Regularisation of the diagonal of the pressure iteration [1 / m2]."""
     nearest_weight: float
-    """V W of two particles one spacing apart [-]."""
+    """Smoothing kernel at a distance of one spacing, times the volume of a particle [-]."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
-        """Compute the constants on a lattice with a spacing [m], for a support radius [m].
-
-        lambda = max_q |sum_j g_j sin(q . x_j)|^2 / a_0 is the factor by which an undamped Jacobi iteration overshoots
-        for the stiffest pressure wave exp(i q . x) of the lattice.
-        """
+        """Compute the constants for a lattice with this spacing [m] and support radius [m]. The relaxation factor makes
+        the Jacobi iteration stable for the stiffest pressure wave."""
         offsets = lattice_offsets(spacing, support, dimension)
         volume = rest_volume(kernel, spacing, support, dimension)
         gradients = volume * kernel.gradient(offsets, support)
@@ -45,9 +41,8 @@ class ProjectionConstants:
         return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
 
     def repair_relaxations(self, repairs: int) -> list[float]:
-        """Return omega of each repair by Chebyshev's roots (Golub and Varga 1961), for waves from `SMOOTHED` to 1 times
-        the greatest stiffness. The greatest omega comes first, because later repairs smooth the waves that it
-        excites."""
+        """Return the relaxation factor of each repair, from the roots of a Chebyshev polynomial (Golub and
+        Varga 1961)."""
         middle, half = 0.5 * (1.0 + SMOOTHED), 0.5 * (1.0 - SMOOTHED)
         roots = np.cos(np.pi * (np.arange(repairs) + 0.5) / repairs)
         return [self.relaxation / float(middle - half * root) for root in roots]
@@ -59,20 +54,19 @@ def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConsta
 
 
 SPACING = 2.0
-"""Distance between nodes of the coarse grid, in spacings of particles."""
+"""Distance between nodes of the coarse grid [particle spacings]."""
 
 
 def endless(discrete: DiscreteScene) -> bool:
-    """Return True if all axes are periodic, so that a coarse correction leaves the level of pressure undetermined."""
+    """Test if all axes are periodic."""
     return bool((np.asarray(discrete.periods) > 0.0).all())
 
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
-    """Make the periodic grid of the coarse correction around the region that particles can reach. The number of nodes
-    along each axis is 4 to 7 times a power of two, so that each coarser grid has half as many.
+    """Make the periodic grid of the coarse correction around the region of the particles.
 
-    Nodes lie on a container's lower walls, half a spacing below the first row of particles: cells with a single row of
-    particles would make solves slow.
+    The number of nodes along each axis is 4 to 7 times a power of two, so that coarser levels can halve it. Nodes lie
+    on the lower walls of a container.
     """
     reach, most = SPACING * scene.discretisation.spacing, max(4 * particles, 512)
     grid = Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)

@@ -1,24 +1,24 @@
-"""Values read from a step of the projection: the pressure that a gauge reads, and the forces on walls that mirror.
+"""Values from a step of the projection: the pressure that a gauge reads, and the forces on mirroring walls.
 
-Particle j pushes i with the force -V (T_i + T_j) g_ij / dt, where T = k L, and wall particle b with -V k_i b_ib / dt,
-where b_ib is the term of b in gamma_i. The momentum flux of these forces is spread evenly along the lines from particle
-to particle, and to the point s_b of the wall's surface (the virial of Irving and Kirkwood 1950):
+Particle j pushes particle i with the force -V (T_i + T_j) g_ij / dt, where T = k L. Wall particle b pushes particle i
+with -V k_i b_ib / dt, where b_ib is the term of b in gamma_i. The momentum flux of these forces is spread evenly along
+the line between two particles, or to the surface point s_b of the wall (Irving and Kirkwood 1950):
 
     dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
 
 in d dimensions, where images have the weight h and mirroring walls the weight 1 - h
-(`cortado.solvers.projection.effects`). The multiplier k / dt is not a stress beside a wall, where neighbours are
-missing, and scatters among uneven particles.
+(`cortado.solvers.projection.effects`). The multiplier k / dt scatters among uneven particles, and it is not a stress
+beside a wall, where neighbours are missing.
 
-Kernels divide impulses, k or dt p, by the time step.
+Kernels divide impulses, which are k or dt p, by the time step.
 
 In addition to the forces of `cortado.solvers.projection.wall_sums`, mirroring walls get the forces of images, in place
 of the part h of the forces on their own wall particles,
 
     sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m,
 
-summed over the images by one solid, or by all walls, with gamma_m of its mirroring wall particles. Walls receive
-exactly the momentum that the fluid loses to them.
+summed over the images by one solid or by all walls, with gamma_m of its mirroring wall particles. Walls receive exactly
+the momentum that the fluid loses to them.
 """
 
 from dataclasses import replace
@@ -51,8 +51,8 @@ TOPIC = "mean_stress"
 
 
 class MeanStress:
-    """The mean normal stress dt p of the sorted particles of a step, given surroundings, and k and T of the last
-    iteration, with their tangents or adjoints, as groups of ``known`` kernel arguments."""
+    """The mean normal stress of sorted particles in a step, with derivatives. ``known`` are kernel arguments
+    by name."""
 
     def __init__(self, system: ParticleSystem):
         discretisation, layout = system.discretisation, system.layout
@@ -67,20 +67,21 @@ class MeanStress:
         return {name: sums.total(context, ALL_WALLS, *known) for name, sums in self._walls.items()}
 
     def impulses(self, context: StepContext, *known: Named) -> wp.array:
-        """Return the mean normal stress times the time step, dt p (n,) [Pa s]."""
+        """Return the mean normal stress times the time step (n,) [Pa s]."""
         found = self._arrays["q"]
         context.launch(self._kernels.forward, self._totals(context, known), *known, q=found)
         return found
 
     def tangent(self, context: StepContext, dot: Tangents, *known: Named) -> NDArray:
-        """Return the tangent (n,) of dt p."""
+        """Return the tangent (n,) of the mean normal stress times the time step."""
         found, walls = self._arrays["q"], self._totals(context, known)
         dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *known) for name, one in self._walls.items()}
         context.launch(self._kernels.tangent, walls, dots, *dot.named, *known, q_dot=found)
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, at: Named, *known: Named) -> None:
-        """From ``q_bar``, which ``at`` has with k and T, add to the adjoints of k, particles and surroundings."""
+        """Add to the adjoints of pressures and particles, given the adjoint ``q_bar`` of the mean normal stress in
+        ``at``."""
         (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
         context.launch(own, self._totals(context, known), *bar.named, at, *known, reach_bar=reach_bar)
         context.launch(pairs, *bar.named, at, *known)
@@ -90,7 +91,7 @@ class MeanStress:
 
 
 def spread_term(d: Discretisation) -> Any:
-    """Return a pair's term -1/2 x_ij . (T_i + T_j) g_ij."""
+    """Return the term of a pair of particles in the mean normal stress."""
     real, vector, gradient = d.precision.real, d.precision.vector, pair_functions(d).gradient
     six, times = symmetric(d.precision).kind, symmetric(d.precision).times
 
@@ -102,7 +103,7 @@ def spread_term(d: Discretisation) -> Any:
 
 @cache
 def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of dt p, given r as the first component of ``reach`` + ``mirrors``."""
+    """Make the kernels of the mean normal stress."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
@@ -149,7 +150,6 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @particle_kernel(adjoint_module, "q_bar +k_bar reach_bar")
     def own_adjoint(k_i: real, reach_i: vector, mirrors_i: vector, q_bar_i: real) -> tuple[real, real, vector]:
-        """Replace the adjoint of q by that of the sum over neighbours, and add to the adjoints of k and r."""
         bar = per * q_bar_i
         return bar, -bar * (reach_i[0] + mirrors_i[0]), vector(-bar * k_i, real(0.0), real(0.0))
 
@@ -167,7 +167,6 @@ def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 def _reach_work(d: Discretisation) -> Any:
-    """Make the work function of the wall term (r, 0, 0)."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -180,7 +179,6 @@ def _reach_work(d: Discretisation) -> Any:
 
 
 def _mirror_work(d: Discretisation) -> Any:
-    """Make the work function of the wall term (-h r, 0, 0), so that mirroring walls have the weight 1 - h."""
     real, gradient, normal = d.precision.real, pair_functions(d).gradient, normal_part(d)
 
     @types_by_name(d.precision, {d.precision.vector: "reach"})
@@ -193,7 +191,7 @@ def _mirror_work(d: Discretisation) -> Any:
 
 @cache
 def pressed_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of p = k / dt from an impulse k."""
+    """Make the kernels that divide pressure times time step by the time step."""
     real, modules = precision.real, [integration_module(precision, False, topic="impulses")] * 3
 
     def pressed(time_step: real, impulse_i: real) -> real:
@@ -204,7 +202,7 @@ def pressed_kernels(precision: Precision) -> Kernels:
 
 @cache
 def image_load_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the sum over images by the walls of ``solid``; ``y`` is p."""
+    """Make the kernels of forces of images on the walls of a solid."""
     real, vector, _ = discretisation.types
     module, tangent_module, adjoint_module = discretisation.modules("image_loads")
     lift = image_sums(discretisation).lift
@@ -238,8 +236,7 @@ def _mirrored_work(d: Discretisation) -> Any:
 
 
 class ImageLoads:
-    """The forces (n,) of images over a particle's volume [N / m^d], of sorted particles; the next call overwrites the
-    arrays."""
+    """Forces of images on sorted particles, divided by the volume of a particle (n,) [N / m^d]."""
 
     def __init__(self, density: Surroundings):
         self._density, self._layout = density, density.system.layout
@@ -248,7 +245,7 @@ class ImageLoads:
         self._faces = FaceShares(density.system)
 
     def total(self, step: StepContext, solid: int, p: wp.array) -> wp.array:
-        """Return the forces by pressures p (n,) [Pa] on the walls of one solid, or on all walls."""
+        """Return the forces by pressures ``p`` (n,) [Pa] on the walls of a solid, or on all walls."""
         found, known = self._vectors["total"], {"y": p, "image": self._density.around["image"]}
         step.launch(self._kernels.forward, known, solid=solid, total=found)
         add(self._walls.total(step, solid, known), found)

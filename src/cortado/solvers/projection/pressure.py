@@ -1,31 +1,30 @@
-"""The projection of velocities, by accelerated Jacobi iterations with a leaky clamp.
+"""The projection of velocities, by accelerated Jacobi iterations that let only part of negative pressures pass.
 
-With k = dt p, the divergence D, in which walls that move have velocities v_b, and the transpose, which is the force,
+Let k = dt p be the pressure impulses. With wall velocities v_b, the divergence D and its transpose, the force, are
 
     (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
     (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
-both with terms by images (`cortado.solvers.projection.effects`),
-
-an iteration from y, an extrapolation of k (Nesterov 1983), is
+both with terms by images (`cortado.solvers.projection.effects`). An iteration begins with y, an extrapolation of k
+(Nesterov 1983), and computes
 
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-b = (1 - f) max(1 - n, 0) / dt lets scattered fluid come together before it resists. sigma, which is near 1 for
-surrounded particles, admits tension. The result is v* - D^T k / m.
+The term b = (1 - f) max(1 - n, 0) / dt lets scattered fluid come together before it resists. The factor sigma, which is
+near 1 for surrounded particles, admits tension. The result is v* - D^T k / m.
 
-A step begins with the pressure of the previous step: the first k is f times the last k, and the first v is v* + f w,
-with the previous step's kick w = -D^T k / m.
+A step begins with the pressure of the previous step. The first k is f times the last k. The first v is v* + f w, with
+the velocity change w = -D^T k / m of the previous step.
 
-A particle that this kick would move towards a wall, gamma . w > 0, by more than a tenth of a spacing begins with v* and
-no pressure. Between walls less than a spacing apart, the pressure that repels it from one wall would throw it at the
-other, harder in each step. The choice has no derivative.
+Some particles begin without pressure, with v*: those that w would move towards a wall, gamma . w > 0, by more than a
+tenth of a spacing. Between walls less than a spacing apart, the pressure from one wall would otherwise throw a particle
+at the other wall, harder in each step. This choice has no derivative.
 
-A scene is shut if every particle has a share c of the coarse pressure. In a shut scene tension is admitted beside walls
-too, sigma = 1, because fluid that fills a container cannot leave the walls.
+A scene is shut if every particle has a share c of the coarse pressure. In a shut scene tension is also admitted beside
+walls, sigma = 1, because fluid that fills a container cannot leave the walls.
 
-A scene is warm if any particle begins with a pressure, and otherwise cold. In a cold scene a coarse correction also
+A scene is warm if any particle begins with a pressure, and cold if none does. In a cold scene a coarse correction also
 precedes the first iteration.
 """
 
@@ -51,7 +50,7 @@ from cortado.sph.moment_functions import symmetric
 
 @cache
 def clamp_functions(precision: Precision) -> SimpleNamespace:
-    """Make Warp functions for the clamp of a pressure: b, its tangent, and the weights of slopes."""
+    """Make Warp functions for the limitation of tension."""
     real = precision.real
 
     @wp.func
@@ -67,8 +66,8 @@ def clamp_functions(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def parts(up: real, down: real):
-        """Return the weights of the slopes of z+ and sigma z-: 1 or 0, and at a corner the mean of both sides. Fluid in
-        rigid motion is at the corner z+ = z- = 0 everywhere."""
+        """Return weights of the slopes for positive and for negative pressure. Each weight is one half at
+        pressure 0."""
         rise, fall = real(0.0), real(0.0)
         if up > real(0.0):
             rise = real(1.0)
@@ -86,8 +85,7 @@ def clamp_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of a pressure iteration. The adjoint of ``update`` is three kernels: of the clamp, and of D
-    without and with an adjoint of A, to which ``whole_adjoint`` adds the part from D."""
+    """Make the kernels of a pressure iteration, with tangent and adjoint."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, sums = precision.pair, projection_sums(discretisation)
     packed, matrix = symmetric(precision), precision.matrix
@@ -119,8 +117,8 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     def update(
         s, omega: real, beta: real, time_step, x, n, of: shared, at, k_out, y_out, T, error: wp.array(dtype=pair_of)
     ):
-        """Do a pressure iteration; write A and the divergence to ``at``, and y' L to T. ``error`` is the pair c (dt
-        e)^2 and c, with the unwanted divergence e and the c of `effects`."""
+        """Compute a pressure iteration: the divergence of velocities, the new pressures, and the ``error`` of each
+        particle."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
         widened = spread(i, x, at.u, s)
@@ -182,7 +180,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     def clamp_adjoint(
         particles: int, omega: real, beta: real, time_step, n, of, at: iterate, k_bar, y_bar, bar, d_bar, S
     ):
-        """Apply the adjoint of the clamp, from those of k' and y' to d_bar of the divergence and S = d_bar L."""
+        """Convert the adjoints of new pressures to adjoints of old pressures and of the divergence."""
         i = wp.tid()
         dt = time_step[i // particles]
         D, full, a = at.d[i], of.weights[i][1], of.a[i]
@@ -212,8 +210,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
         return d_bar_i * L_i
 
     def divergence_adjoint_of(name: str, back: Any, kind: Any, times: Callable[..., Any]) -> wp.Kernel:
-        """Make the kernel that turns the adjoint of D, and with a full matrix S also that of A, into that of u."""
-
         @typed.arrays
         def divergence_adjoint(s, x, g, of, u, A, d_bar, S: wp.array(dtype=kind), bar, u_bar):
             i = s.first + wp.tid() // LANES
@@ -242,7 +238,7 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
 
 TOWARDS = 0.1
-"""Distance beyond which the previous step's kick must not move a particle towards a wall in a step [spacings]."""
+"""Greatest motion of a particle towards a wall by the pressure of the previous step [spacings]."""
 
 
 @cache
@@ -256,8 +252,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def start(
         spacing, time_step, k_before_i, kick_before_i, weights_i, beside_i, surfaced, v_star_i
     ) -> tuple[weights4, real, real, vector]:
-        """Return weights, k, y and u of a particle; k, y and the kick are 0 if the kick would move it towards a
-        wall."""
+        """Return the weights, the pressures and the velocity of a particle at the start of the iterations."""
         full, tension = weights_i[1], weights_i[0]
         if wp.dot(kick_before_i, beside_i) > real(0.0) and time_step * wp.length(kick_before_i) > towards * spacing:
             full = real(0.0)
@@ -273,7 +268,8 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def begin(
         particles: int, spacing: real, time_step, k_before, kick_before, beside, v_star, surfaced, weights, first, warm
     ):
-        """Write weights, and k, y and u of a step's first iterate; set ``warm`` to 1 in scenes with a pressure."""
+        """Write the weights, pressures and velocities at the start of the iterations. Set ``warm`` to 1 in scenes with
+        a pressure."""
         i, member = wp.tid(), wp.tid() // particles
         kept, pressure, _same, velocity = begun(
             spacing, time_step[member], k_before[i], kick_before[i], weights[i], beside[i], surfaced[member], v_star[i]

@@ -1,17 +1,18 @@
-"""Repairs of the density, which change positions only, are Jacobi iterations from x', the positions after the shift:
+"""Repairs of the density, which change only positions. They are Jacobi iterations from x', the positions after the
+shift:
 
     lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
 
-with images in n and d (`cortado.solvers.projection.effects`).
+with images in the number density n and in d (`cortado.solvers.projection.effects`).
 
-The bound of a sixth of a spacing s matters where walls leave no room: unbounded repairs would throw a particle through
-a wall.
+A displacement is at most a sixth of a spacing s. Where walls leave no room, unbounded repairs would throw a particle
+through a wall.
 
-Each iteration has its own omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed, because a repair
-would act once more in the next step. The factor r of `cortado.solvers.projection.effects` restricts repairs of low
-densities to the interior. g and a are those at the start of the step; n is that of the positions x_k, over the
-neighbours at the start.
+Each iteration has its own relaxation factor omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed,
+because a repair would then act a second time in the next step. The factor r of `cortado.solvers.projection.effects`
+restricts repairs of low densities to the interior. The gradients g and the diagonal a are those at the start of the
+step. n is computed at the positions x_k, over the neighbours at the start of the step.
 """
 
 from functools import cache
@@ -37,7 +38,7 @@ FARTHEST = 1.0 / 6.0
 
 @cache
 def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of lambda' from n(x_k), and of x_k+1 from lambda'."""
+    """Make the kernels of a repair."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, weights4 = precision.pair, weights_type(precision)
     sums, densities = projection_sums(discretisation), density_sums(discretisation)
@@ -57,7 +58,6 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     @wp.func
     def along(change: vector, back: vector, held: real) -> vector:
-        """Return the derivative of ``held`` times ``back`` along a ``change`` of ``back``, which is symmetric."""
         if held < real(1.0):
             return held * (change - (wp.dot(back, change) / wp.dot(back, back)) * back)
         return change
@@ -66,8 +66,8 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     @typed.kernel(module)
     def measure(s, omega: real, of, x_now, c_in, c_out, excess, error: wp.array(dtype=pair_of)):
-        """Compute lambda' from densities; ``c`` is lambda, ``excess`` n - 1, and ``error`` has the compression
-        twice."""
+        """Compute the multipliers of a repair from densities. ``c_in`` are the old and ``c_out`` the new multipliers,
+        ``excess`` is the density error."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x_now, s)
         surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], i // s.particles, s), s)
@@ -116,7 +116,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     @particle_kernel(module, "held x_now", both, numbers=["spacing"], typed=typed)
     def move(pushed, lifted, spacing, m_i, gamma_i, c_i, x_moved_i) -> tuple[real, vector]:
-        """Move a particle by lambda' within the bound; ``held`` is the part of the full displacement."""
+        """Return the fraction of the displacement that the bound allows, and the new position of a particle."""
         back = (pushed + lifted + c_i * gamma_i) / m_i
         most, length, part = farthest * spacing, wp.length(back), real(1.0)
         if length > most:
@@ -135,14 +135,12 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     @particle_kernel(adjoint_module, "+m_bar +x_moved_bar f", typed=typed)
     def begin_adjoint(m_i, x_now_i, x_moved_i, held_i, x_now_bar_i) -> tuple[real, vector, vector]:
-        """Apply the adjoint of the particle's terms in x_k+1; f is the adjoint of the sum over neighbours."""
         back = (x_moved_i - x_now_i) / held_i
         bar = along(x_now_bar_i, back, held_i)
         return wp.dot(bar, back) / m_i, x_now_bar_i, -bar / m_i
 
     @typed.kernel(adjoint_module)
     def move_adjoint(s, omega: real, x, of, c_in, c_out, excess, f, c_bar, bar, n_now_bar):
-        """Apply the adjoint of the sum over neighbours in x_k+1, and of lambda' with respect to n."""
         i = s.first + wp.tid() // LANES
         by_c, x_part = push_back(i, x, c_out, f, s)
         widened, x_lift = lift_back(i, x, c_out, of.image, f, s)
@@ -168,7 +166,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
 
 def repair_term(d: Discretisation) -> Any:
-    """Make the work function by which adjoints of n(x_k) act on solids."""
+    """Make the Warp function for the adjoints of solids, given adjoints of the density."""
     real, vector, weight = d.precision.real, d.precision.vector, pair_functions(d).weight
 
     def repair_work(

@@ -1,16 +1,17 @@
-"""Particles stay on their side of a sheet: a position at the end of a step on the other side is moved back.
+"""Keeps particles on their side of a sheet: a particle that ends a step on the other side is moved back.
 
 In the frame of a sheet a particle is at y_0 before the step and at y after the step. A face of the sheet has the normal
-n, and h = n . (y - a) is the particle's height above it. If the path from y_0 to y crosses the face, or ends nearer to
-it than e = s / 20, the particle is put back on the side of y_0:
+n, and h = n . (y - a) is the height of the particle above the face, with a point a of the face. The path from y_0 to y
+may cross the face, or end nearer to it than e = s / 20 with the spacing s. The particle is then put back on the side of
+y_0:
 
     y' = y + (e sign h_0 - h) n.
 
 This is done up to three times, each time with the face that the path meets first. If the path still crosses the sheet,
 as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0.
 
-If a pose changes by c', w' and g' (`MovingWalls`), a point x of the solid moves by t(x) = c' + w' x (x - c) + g' (x -
-c). With N = R n, a relative change D = x' - t(x) becomes D - N (N . D + e sign h_0 g'), and then t is added again.
+If a pose changes by c', w' and g' (`MovingWalls`), its points x move by t(x) = c' + w' x (x - c) + g' (x - c). With N =
+R n, a relative change D = x' - t(x) becomes D - N (N . D + e sign h_0 g'), and then t is added again.
 """
 
 from functools import cache
@@ -29,15 +30,16 @@ from cortado.particles.wall_terms import share_kinds
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 NEAREST = 0.05
-"""Least distance e of a particle from a sheet at the end of a step [spacings]."""
+"""Smallest distance of a particle from a sheet at the end of a step [spacings]."""
 ROUNDS = 3
-"""Greatest number of times that a particle is moved back in a step."""
+"""Greatest number of times that a particle is put back in a step."""
 NONE = -1
 
 
 @cache
 def side_kernels(precision: Precision) -> Kernels:
-    """Make the kernels that keep particles on their side of sheet k; ``least`` is e."""
+    """Make the kernels that keep particles on their side of a sheet. ``least`` is the smallest distance from a
+    sheet."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, sheets_of = neighbourhood_type(precision), sheets_type(precision)
     (scale_of, seen_from), (query, meets, goes_through) = sheet_functions(precision), face_functions(precision)
@@ -65,8 +67,8 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def time_of(start: vector, y: vector, face: int, least: real, sheets: sheets_of) -> real:
-        """Return the part of the path at which a particle meets a face, 1 if it only ends too near the face, otherwise
-        2."""
+        """Return the fraction of the path before a face, 1 if the path only ends too close to the face, or 2 without
+        contact."""
         n, a = sheets.faces.normals[face], sheets.faces.places[face, 0]
         side = side_of(start, face, sheets)
         h_0, h = side * wp.dot(n, start - a), side * wp.dot(n, y - a)
@@ -84,7 +86,8 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def kept(start: vector, end: vector, k: int, least: real, sheets: sheets_of):
-        """Return y', the faces by which y was moved, and 1 if the particle stays beside the sheet, else 0."""
+        """Return the new position, the touched faces, and 1 if the particle keeps its old position relative to the
+        sheet, else 0."""
         y, used = end, wp.vec3i(NONE, NONE, NONE)
         rounds = int(ROUNDS)
         for round in range(rounds):
@@ -124,7 +127,7 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def twist(x: vector, middles: poses, moved: poses, turned: poses, k: int, member: int, s: neighbourhood) -> vector:
-        """Return t(x) of a solid whose middle changes by ``moved`` and whose rotation changes by ``turned``."""
+        """Return the motion of the point ``x`` of a solid, given the changes of the solid's pose."""
         arm = x - middles[member, k]
         grown = s.scales_dot[member, k] / s.scales[member, k]
         return moved[member, k] + wp.cross(turned[member, k], arm) + grown * arm
@@ -196,7 +199,7 @@ def side_kernels(precision: Precision) -> Kernels:
 
 
 class Sides:
-    """Keeps a solver's particles on their sides of all sheets, one after the other; with several sheets twice."""
+    """Keeps the particles of a solver on their sides of all sheets."""
 
     def __init__(self, sheets: Sheets, spacing: float, layout: Layout):
         self._kernels, self._sheets, count = side_kernels(layout.precision), sheets, len(sheets.numbers)
@@ -205,10 +208,10 @@ class Sides:
         vector = layout.precision.vector
         self._kept = [layout.arrays(x=vector)["x"] for _ in self._passes]
         self._none = layout.arrays("_bar", **share_kinds(layout.precision))
-        """Adjoints for sheets that do not move; nothing reads them."""
 
     def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
-        """Return positions (n,) of sorted particles at the end of a step, given the positions without sheets."""
+        """Return the positions (n,) of sorted particles after a correction at sheets. ``x_now`` are the positions
+        before the correction."""
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
             x_now = x_kept
@@ -222,8 +225,7 @@ class Sides:
             x_now = x_kept
 
     def adjoint(self, step: StepContext, bar: Adjoints, x_now: wp.array, x_now_bar: wp.array) -> None:
-        """Apply the adjoint of `keep`: replace ``x_now_bar``, and add to the adjoints of solids and of positions at the
-        start of the step."""
+        """Apply the adjoint of `keep`. Update ``x_now_bar``, and add to the adjoints of solids and of old positions."""
         self.keep(step, x_now)
         given = [x_now, *self._kept]
         for k, before, x_kept in reversed([*zip(self._passes, given, self._kept, strict=False)]):

@@ -1,5 +1,4 @@
-"""The velocity projection as the solver of a scene, with the tangent and the adjoint of a replayed step; every sum is a
-gather."""
+"""The projection as the solver of a scene, with the tangent and the adjoint of a step."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -48,7 +47,7 @@ class ProjectionTangent(ParticleTangent):
             **{"v_end_dot": v_end, **layout.arrays(T=precision.six)},
             **{"k_before_dot": self.carried_dot[IMPULSE], "kick_before_dot": self.carried_dot[KICK]},
         }
-        """Tangents of the arrays of a step, by names of kernel arguments."""
+        """Tangents by names of kernel arguments."""
         self._around = self.density.around
         self._known = self._own, *self.dot.named, self._around, solver.known
         self._bodies = None
@@ -114,7 +113,6 @@ class ProjectionTangent(ParticleTangent):
         return self._over_time(solver.mean_stress.impulses(context, *known), change)
 
     def _over_time(self, impulses: wp.array, change: NDArray) -> NDArray:
-        """Return the tangent of impulses divided by the time step, given the tangent of the impulses."""
         particles = self._solver.layout.particles
         dt, dt_dot = (of.parameters["time_step"].numpy().repeat(particles) for of in (self._solver, self.dot))
         found: NDArray = change / dt - impulses.numpy() * dt_dot / dt**2
@@ -138,7 +136,7 @@ class ProjectionAdjoint(ParticleAdjoint):
             **layout.arrays(f=precision.vector, S=precision.six, T=precision.six),
             "v_star_bar": self.bar.fields["v"],
         }
-        """Adjoints of the arrays of a step, by names of kernel arguments; f is that of the force."""
+        """Adjoints by names of kernel arguments."""
         self.bar = replace(self.bar, kick=own["kick_before_bar"])
         self._around = self.density.around
         self._known = self._own, *self.bar.named, self._around, solver.known
@@ -171,7 +169,6 @@ class ProjectionAdjoint(ParticleAdjoint):
         self._go_back(counts, state_bar, parameters, within)
 
     def _begin(self, state_bar: State, parameters: Parameters) -> None:
-        """Turn the adjoint of a step's result into the adjoints of the last positions, velocities and k."""
         solver, own, context = self._solver, self._own, self._solver.context(parameters)
         free_bar = self.unsort(context, state_bar)
         scene = {"x_scene": free_bar.positions, "v_scene": free_bar.velocities}
@@ -189,7 +186,6 @@ class ProjectionAdjoint(ParticleAdjoint):
     def _go_back(
         self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
     ) -> None:
-        """Turn the adjoints that `_begin` wrote into the adjoint of the state, through the step in reverse."""
         solver, kernels, own, known = self._solver, self._solver.kernels, self._own, self._known
         context, (iterations, repairs) = solver.context(parameters), counts
         end, last = solver.end_of(iterations), solver.repaired[repairs]
@@ -231,8 +227,8 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.bar.solids.add(context.launch, densities, *known, x=at["x_now"])
 
     def _iterate(self, context: StepContext, k: int, moves: bool) -> None:
-        """Apply the adjoint of one pressure iteration. With ``moves`` A has an adjoint too, because the iteration's A
-        moves particles."""
+        """Apply the adjoint of a pressure iteration. ``moves`` is true if the shift uses the velocity gradients of the
+        iteration."""
         solver, own, known = self._solver, self._own, self._known
         velocity, pressure = solver.kernels.velocity, solver.kernels.pressure
         (clamp, divergence, whole), more = pressure.update.adjoint, dict[str, wp.array]()
@@ -255,7 +251,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver.coarse.where_due(k, correct)
 
     def _diverge(self, context: StepContext, kernel: wp.Kernel, at: Named, more: Named) -> None:
-        """Turn the adjoints d_bar and S into the adjoint of u."""
+        """Convert the adjoint of the divergence to the adjoint of velocities."""
         own, known = self._own, self._known
         context.launch(kernel, more, at, *known)
         self._faces.add(context, self.bar, *known, u=at["u"], spread=own["d_bar"])
@@ -264,7 +260,7 @@ class ProjectionAdjoint(ParticleAdjoint):
 
 
 class Projection(ProjectionSteps):
-    """The projection solver with derivatives; see `Solver`."""
+    """The projection solver with derivatives."""
 
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         return ProjectionTangent(self, parameters_dot)
@@ -280,7 +276,7 @@ class ProjectionMaker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the projection solver, or without pressure PCISPH, as then the steps of all solvers are equal."""
+        """Make the projection solver. Without pressure, make PCISPH, which then takes equal steps."""
         system, table = particle_system(setting), self._table
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)

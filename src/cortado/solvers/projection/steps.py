@@ -4,26 +4,27 @@ density.
 A step moves particles by dt v and by the shift delta, repairs densities, and optionally corrects velocities.
 
 Particles of the interior are shifted towards regions with fewer particles (Lind et al. 2012; Skillen, Lind, Stansby and
-Rogers 2013). Pairs that are nearer than 0.65 s are moved apart everywhere. The rate follows the velocity gradient and
-the tension, so that the shift does not stir a fluid at rest:
+Rogers 2013). Pairs of particles that are nearer than 0.65 s, with the spacing s, are moved apart everywhere. The rate
+follows the velocity gradient and the tension, so that the shift does not stir a fluid at rest:
 
     delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
     grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
     r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
 
 with smooth bounds of 0.5 on r, and of 0.1 s on |delta|. Under tension particles clump (the tensile instability,
-Monaghan 2000), so the shift is faster there. P projects out the direction of the surface, g + gamma. u and w are
-weights of `cortado.solvers.projection.effects`: u is 0 at surfaces; w, by which low densities are repaired, is 0 near
-surfaces and beside walls. The shift does not change velocities, because a correction by (delta . grad) v adds energy.
+Monaghan 2000), so the shift is faster there. P projects out the direction of the surface, g + gamma. The weights u and
+w are from `cortado.solvers.projection.effects`: u is 0 at surfaces, and w, the weight of repairs of low densities, is 0
+near surfaces and beside walls. The shift does not change velocities, because a correction by (delta . grad) v adds
+energy.
 
 With ``velocities_follow`` velocities follow, to first order, the positions after the shift and the repairs (Xu, Stansby
 and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
-where x_K are the positions after the last repair, and A is that of the last iteration of the pressure.
+where x_K are the positions after the last repair, and A is from the last iteration of the pressure.
 
-The repairs of density begin from x + dt v + delta.
+The repairs of the density begin from x + dt v + delta.
 """
 
 from functools import cache, cached_property
@@ -61,24 +62,24 @@ from cortado.sph.parts import Carried, StepContext, integration_module
 
 RATE = 20.0
 GREATEST = 0.5
-"""Smooth bound on 20 dt |grad v|; a faster shift overshoots."""
+"""Upper bound on the rate of the shift."""
 FARTHEST = 0.1
 """Greatest shift of a particle in a step [spacings]."""
 SURFACE = 0.03
-"""|g| s below which the direction of a surface is unknown."""
+"""Smallest magnitude of the surface normal vector, times the spacing, that determines a direction."""
 AWAY = 4.0
-"""Factor by which near pairs are moved apart faster than other particles are shifted."""
+"""Additional factor for moving close pairs apart."""
 LEAST = 1e-5
-"""Softness e in 20 (sqrt(q^2 + e^2) - e), q = dt |grad v|; the value is 0 and smooth at rest."""
+"""Velocity gradient times time step below which the rate of the shift is quadratic."""
 PULLED = 60.0
 """Factor of the rate of the shift under tension."""
 WEAK = 0.004
-"""The c below which the effect of tension is about quadratic in c."""
+"""Dimensionless tension below which the rate of the shift is quadratic."""
 
 
 @cache
 def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the shift delta, with A = sum_j v_ij g_ij^T, k = dt p and ``beside`` = gamma."""
+    """Make the kernels of the shift."""
     precision, modules = d.precision, d.modules(f"projection_{dimension}d")
     real, vector, typed = precision.real, precision.vector, types_by_name(precision)
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -106,8 +107,7 @@ def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def following_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of velocities v' that follow the shift and the repairs; the adjoint of v overwrites that of
-    v'."""
+    """Make the kernels that correct velocities for the shift and the repairs."""
     precision, modules = d.precision, d.modules(f"projection_following_{dimension}d")
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -121,7 +121,7 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def moving_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of positions before the first repair; the adjoint of delta overwrites that of the positions."""
+    """Make the kernels that move particles before the first repair."""
     modules = [integration_module(precision, forward, topic="moving") for forward in (True, False, False)]
     real, vector = precision.real, precision.vector
 
@@ -132,13 +132,11 @@ def moving_kernels(precision: Precision) -> Kernels:
 
 
 IMPULSE = "pressure_impulse"
-"""Name of k = dt p in a state."""
+"""Name of the state field for pressure times time step."""
 KICK = "pressure_kick"
-"""Name, in a state, of the kick -D^T k / m that a step's pressures add to velocities."""
+"""Name of the state field for the velocity change by pressures."""
 MOMENTUM = 8.0 / (1.0 + 101.0**0.5)
-"""beta of the first iteration, (t - 1) / t' with t' = (1 + sqrt(1 + 4 t^2)) / 2 (Nesterov 1983); t = 5 because the
-first k comes from the previous step. Later iterations have beta = 0: with momentum after a coarse correction, many
-would not converge."""
+"""Momentum of the first pressure iteration (Nesterov 1983). Later iterations have no momentum."""
 
 
 class ProjectionSteps(ParticleSolver):
@@ -150,8 +148,8 @@ class ProjectionSteps(ParticleSolver):
     def __init__(
         self, system: ParticleSystem, table: ProjectionSolver, constants: ProjectionConstants, grid: Grid, endless: bool
     ):
-        """Prepare steps with the iterations and repairs of a scene's ``table``. A coarse ``grid`` corrects the pressure
-        between iterations, in a cold scene also before the first iteration, and never in an ``endless`` scene."""
+        """Prepare steps with the settings in a scene's ``table``. The ``grid`` is for the coarse pressure correction.
+        An ``endless`` scene, with all axes periodic, has no coarse correction."""
         self.constants, repairs = constants, table.repairs
         limits = LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
         if table.tolerance is not None:
@@ -171,11 +169,10 @@ class ProjectionSteps(ParticleSolver):
         kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates = [self.layout.arrays(**self._iterate_kinds)]
-        """Iterates before each iteration: u, A, the divergence of u, y and k; the last slot has the final u and y =
-        k."""
+        """Velocities, velocity gradients, divergences and pressures before each iteration. The last entry is the
+        result."""
         self.repaired = [self.layout.arrays(**self._repair_kinds)]
-        """Values before each repair: positions x_k, lambda, n - 1, and the part of the full displacement that moved a
-        particle."""
+        """Positions, multipliers and density errors before each repair."""
         vectors = dict.fromkeys(("x_star", "v_star", "kick", "x_moved", "delta"), vector)
         self.known: dict[str, Any] = {
             **self.around,
@@ -185,8 +182,7 @@ class ProjectionSteps(ParticleSolver):
             **{"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK]},
             "surfaced": self.density.surfaced,
         }
-        """Arguments of kernels by name: surroundings, constants and the arrays of a step; T is y L of the present
-        iteration."""
+        """Arrays and constants by names of kernel arguments."""
         self.sides = None if system.sheets is None else Sides(system.sheets, constants.spacing, self.layout)
         """Keeps particles on their sides of sheets; None without sheets."""
         self.following = following_kernels(*own) if table.velocities_follow else None
@@ -195,9 +191,8 @@ class ProjectionSteps(ParticleSolver):
         self.coarse = Coarse(system, grid, self.bodies, endless)
         self.known["warm"] = self.coarse.warm
         self.corrected = [self._new_corrected()]
-        """Iterates after the coarse correction, from which pressure iterations begin."""
+        """Velocities and pressures after each coarse correction."""
         self.repair_relaxations = constants.repair_relaxations(repairs)
-        """omega of each repair."""
         self.loops = (
             Loop(limits, self.layout, self.launch, "iterations", "divergence", ROOT_MEAN_SQUARE),
             Loop(LoopLimits(repairs, repairs, 0.0, 0.0), self.layout, self.launch, "repairs", "density_errors"),
@@ -280,8 +275,7 @@ class ProjectionSteps(ParticleSolver):
         return self._context.parameters
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Do all of a step before the pressure iterations: sort, add up explicit forces, predict v* = v + dt a, and
-        write the first iterate."""
+        """Compute a step up to the pressure iterations: sort particles, add up forces, and predict velocities."""
         context = self.sort(state, parameters)
         if self.bodies is not None:
             self.bodies.begin(context, self.carried[IMPULSE])
@@ -292,7 +286,7 @@ class ProjectionSteps(ParticleSolver):
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Do pressure iteration k, from the iterates of slot ``before`` to those of slot ``after``."""
+        """Compute pressure iteration ``k``. ``before`` and ``after`` are indices into `iterates`."""
         old, at, new = self.iterates[before], self.corrected[before], self.iterates[after]
 
         def correct() -> None:
@@ -309,12 +303,12 @@ class ProjectionSteps(ParticleSolver):
         return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
-        """Return the drift of walls, with the motion of free bodies under the pressure y of an iterate."""
+        """Return the divergence by moving walls, with free bodies under the pressures of an iteration."""
         drift = self.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
     def settle(self, context: StepContext, last: int) -> None:
-        """Write the positions after moving by the new velocities and the shift."""
+        """Write the positions after the new velocities and the shift."""
         if self.bodies is not None:
             self.bodies.settle(context, self.iterates[last]["y"])
         end, first = self.end_of(last), self.repaired[0]
@@ -324,19 +318,18 @@ class ProjectionSteps(ParticleSolver):
         first["c"].zero_()
 
     def end_of(self, slot: int) -> dict[str, wp.array]:
-        """Return k, v and the A of the last iteration, given the slot with its result."""
+        """Return the pressures, velocities and velocity gradients of the last iteration."""
         end = self.iterates[slot]
         return {"k": end["k"], "v_new": end["u"], "A": self.corrected[max(slot - 1, 0)]["A"]}
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Do repair k, from the positions of slot ``before`` to those of slot ``after``."""
+        """Compute repair ``k``. ``before`` and ``after`` are indices into `repaired`."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
         measured = {"c_in": at["c"], "c_out": new["c"], "omega": self.repair_relaxations[k]}
         context.launch(kernels.measure.forward, measured, at, self.known, error=self.loops[1].errors)
         context.launch(kernels.move.forward, new, self.known)
 
     def _finish(self, context: StepContext, iterations: int, repairs: int, new_state: State) -> wp.array:
-        """Write the new state, and return its velocities, sorted."""
         end, last = self.end_of(iterations), self.repaired[repairs]
         v_end = end["v_new"]
         if self.following is not None:

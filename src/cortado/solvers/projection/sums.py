@@ -1,5 +1,4 @@
-"""Sums over neighbours of the projection, and the velocity u = v* - D^T y / m of `cortado.solvers.projection.pressure`,
-with derivatives; g_ij = V grad W_ij."""
+"""Sums over neighbours in the projection, and velocities under pressures, with derivatives."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -16,18 +15,16 @@ from cortado.solvers.projection.wall_sums import types_by_name
 from cortado.sph.moment_functions import cross_terms_function, moment_functions, symmetric
 
 CROWDED = 0.25
-"""R, the greatest additional weight of close pairs in a shift (Monaghan 2000); without a bound gradients of a splash
-grow by ten orders of magnitude."""
+"""Greatest additional weight of close pairs in the shift (Monaghan 2000)."""
 APART = 0.65
-"""Distance below which a shift moves pairs apart [spacings]."""
+"""Distance below which the shift moves pairs apart [spacings]."""
 UNEQUAL = 2.0
-"""Additional weight of a lighter neighbour in the diagonal; without it an iteration overshoots if heavy particles push
-a light one."""
+"""Additional weight of neighbours with a different mass in the diagonal of the pressure iteration."""
 
 
 @cache
 def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the sums over neighbours; a symmetric matrix is its diagonal and its entries yz, xz and xy.
+    """Make the sums over neighbours. A symmetric matrix is its diagonal and its entries yz, xz and xy.
 
     - ``moments``: six sums, with the spacing l. ``per_nearest`` is 1 / (V W(l)), ``per_apart`` 1 / (0.65 l)^2.
 
@@ -38,11 +35,11 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
           sum p_ij,  p_ij = max(1 - |x_ij|^2 / (0.65 l)^2, 0)^2 x_ij
           sum V W_ij
 
-    - ``force``: sum_j T_j g_ij with T = k L. The adjoint turns adjoints f into the symmetric part of sum f_ij g_ij^T.
+    - ``force``: sum_j T_j g_ij with T = k L. The adjoint returns the symmetric part of sum f_ij g_ij^T for adjoints f.
     - ``velocity_gradient``: the rows of A = sum v_ij g_ij^T; the velocity gradient is A M^-1. The adjoint of v
       lacks the term A_bar_i g_i.
     - ``divergence_back``: the adjoints of v and x for a symmetric adjoint S = d L of A, with the adjoint d of L : A.
-    - ``push``: sum (c_i + c_j) g_ij. The adjoint turns adjoints f into sum g_ij . f_ij.
+    - ``push``: sum (c_i + c_j) g_ij. The adjoint returns sum g_ij . f_ij for adjoints f.
     """
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
@@ -55,24 +52,21 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
-        """Return the entries yz, xz and xy of (a b^T + b a^T) / 2."""
         return real(0.5) * (cross_terms(a, b) + cross_terms(b, a))
 
     @wp.func
     def mobility(m_i: real, m_j: real) -> real:
-        """Return h_ij / m_j."""
         r = (m_i - m_j) * reciprocal(m_i + m_j)
         return (real(1.0) + unequal * r * r) * reciprocal(m_j)
 
     @wp.func
     def slope_of_h(m_i: real, m_j: real) -> real:
-        """Return the derivative of h_ij with respect to m_i."""
         per_both = reciprocal(m_i + m_j)
         return real(4.0) * unequal * (m_i - m_j) * m_j * per_both * per_both * per_both
 
     @wp.func
     def closeness(near: real) -> real:
-        """Return 1 + R q / (1 + q / 4), q = near^4."""
+        """Return the weight of a pair in the shift. It grows for close pairs."""
         q = near * near * near * near
         return real(1.0) + crowded * q * reciprocal(real(1.0) + real(0.25) * q)
 
@@ -84,12 +78,10 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def nearness(x_ij: vector, per_apart: real) -> real:
-        """Return max(1 - |x_ij|^2 / (0.65 s)^2, 0)."""
         return wp.max(real(1.0) - per_apart * wp.dot(x_ij, x_ij), real(0.0))
 
     @wp.func
     def parted(x_ij: vector, change: vector, per_apart: real) -> vector:
-        """Return the derivative of p_ij along a change of x_ij."""
         w = nearness(x_ij, per_apart)
         return w * (w * change - (real(4.0) * per_apart * wp.dot(x_ij, change)) * x_ij)
 
@@ -206,8 +198,7 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of u and the kick u - v*. The kernel ``pull_tangent`` runs before the tangent, and
-    ``own_adjoint`` before the adjoint; ``time_adjoint`` adds the term from v* = v + dt a to the adjoint of dt."""
+    """Make the kernels of velocities under pressures, with derivatives."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)
@@ -220,7 +211,7 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
     @particle_kernel(module, "kick u", both, typed=typed)
     def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
-        """Return the kick -D^T y / m and u = v* + kick; T is y L."""
+        """Return the velocity change by pressures, and the new velocity."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
         return change, v_star_i + change
 
@@ -252,7 +243,6 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
     @particle_kernel(adjoint_module, "+v_bar +m_bar T f kick_bar", typed=typed)
     def own_adjoint(m_i, v_star_i, y_i, L_i, u_i, u_bar_i, kick_bar_i) -> tuple[vector, real, six, vector, vector]:
-        """Write f = -(u_bar + kick_bar) / m and T = y L; the adjoint of the kick is 0 afterwards."""
         bar = u_bar_i + kick_bar_i
         return u_bar_i, wp.dot(bar, v_star_i - u_i) / m_i, y_i * pack(L_i), -bar / m_i, vector()
 

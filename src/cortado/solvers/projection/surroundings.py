@@ -1,5 +1,4 @@
-"""Surroundings of particles: number density (`cortado.sph.density`), moments of neighbours, sums over walls, and the
-quantities of `cortado.solvers.projection.effects`, with derivatives."""
+"""Number densities, moments of neighbours, and sums over walls for each particle, with derivatives."""
 
 from functools import cache, partial
 from typing import Any
@@ -22,7 +21,7 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the surroundings."""
+    """Return the Warp types of a particle's surroundings by name."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}
@@ -32,14 +31,13 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 
 def bar_entries(precision: Precision) -> dict[str, Any]:
-    """Return names and types of the adjoints of surroundings, without Q, which only a depends on."""
+    """Return the Warp types of the adjoints of surroundings by name."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of all surroundings. Between the adjoint's two kernels the adjoints of M and Q are six numbers
-    each, M_pull and Q_pull."""
+    """Make the kernels that compute the surroundings of all particles, with derivatives."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
@@ -72,7 +70,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @typed.kernel(module)
     def surroundings(s, least: real, per_nearest: real, per_apart: real, x, v, m, n, of, surfaced: wp.array(dtype=int)):
-        """Write surroundings; set ``surfaced`` to 1 in scenes with a free surface."""
+        """Write the surroundings of all particles. Set ``surfaced`` to 1 in scenes with a free surface."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
@@ -189,7 +187,6 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @typed.kernel(adjoint_module)
     def own_adjoint(least: real, m, n_bar, of, m_bar, bar, M_pull, Q_pull):
-        """Add to the adjoints of the moments, given the adjoints of the quantities computed from moments."""
         i = wp.tid()
         M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
             of.M[i],
@@ -246,7 +243,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 class Surroundings(Density):
-    """The measurement of the number density n and of all surroundings."""
+    """Computes the number density, the moments and the wall sums of particles."""
 
     def __init__(self, system: ParticleSystem, topic: str, constants: ProjectionConstants):
         kernels = surrounding_kernels(system.discretisation, system.walled.dimension)
@@ -256,7 +253,7 @@ class Surroundings(Density):
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
         self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
-        """(members,) 1 if a scene has a free surface, a particle without a share of the coarse pressure."""
+        """1 for each scene with a free surface, else 0 (members,)."""
 
     def measure(self, context: StepContext) -> None:
         self.surfaced.zero_()

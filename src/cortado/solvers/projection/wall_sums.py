@@ -1,30 +1,32 @@
-"""The sums by which walls push a particle of the projection, with derivatives.
+"""Sums by which walls push a particle in the projection, with derivatives.
 
 With g_ib = V grad W_ib, of which n_b n_b^T g_ib is the part along the normal of a wall, the sums over wall particles b
-are
+with weights w_b are
 
     normal = sum w_b n_b n_b^T g_ib,   whole = sum w_b g_ib,   nu = V sum w_b W_ib,
 
-and for moving walls the drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls push along
+and for moving walls with velocities v_b the drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls
+push along
 
     gamma = normal + e (whole - normal),   e = S(0.1, 0.4) of (whole^2 - normal^2) / (whole^2 + 0.01 a_0 / 20).
 
-Along a flat wall and in a concave corner e is 0, so that the arrangement of wall particles causes no friction. At an
-edge that protrudes into the fluid the parts along normals add up to only a third of the missing sum, and e is 1.
+Along a flat wall and in a concave corner the edge factor e is 0, so that the arrangement of wall particles causes no
+friction. At an edge that protrudes into the fluid the parts along normals add up to only a third of the missing sum,
+and e is 1.
 
-The pressure of a particle pushes the walls of one solid along gamma_s / V,
+The pressure of a particle pushes the walls of one solid s along gamma_s / V,
 
     gamma_s = normal_s + e (whole_s - normal_s)
 
-with the sums above over the wall particles of the solid, and e from those over all walls.
+with the sums above over the wall particles of the solid, and e from the sums over all walls.
 
-Flat faces of moving solids act by images of the fluid instead of wall particles. In reverse mode a sum over images is a
-work W that is linear in adjoints,
+Flat faces of moving solids act through images of the fluid instead of wall particles. In reverse mode a sum over images
+is a work W that is linear in adjoints,
 
     W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R (u_j + B_j x_ij)) . g_i' + e_i swept . g_i' / dt
                - 1/2 h_i k_i (q_i + q_j) x_i' . g_i'),
 
-because the lift is the transpose of the spread. B is the slope of the push by a coarse pressure. Warp differentiates W
+because ``lift`` is the transpose of ``spread``. B is the slope of the push by a coarse pressure. Warp differentiates W
 with respect to the poses of the solid before and after the step. Gradients with respect to particle positions are in
 other modules, except the part through the edge factor e.
 """
@@ -53,16 +55,15 @@ from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
-"""Two limits of the part of |whole|^2 that is not along normals: e is 0 below the first limit and 1 above the second.
-This part is below 0.02 along flat walls and in corners of a box, 0.3 at 1.5 spacings from an edge, and 0.75 diagonally
-in front of an edge."""
+"""Limits of the fraction of the wall gradient that is not along normals. Below the first limit a wall counts as flat,
+above the second limit as an edge."""
 DIRECTION = 0.01
-"""gamma^2 below which the direction of a wall is unknown, in parts of 0.05 a_0."""
+"""Relative size of the wall gradient below which the direction of a wall is unknown."""
 
 
 @cache
 def edge_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
-    """Make Warp functions of e from normal, whole and 0.05 a_0, and of the adjoints of normal and whole."""
+    """Make Warp functions of the factor for edges of walls, with derivatives."""
     real, vector, smoothstep = precision.real, precision.vector, moment_functions(precision, dimension).smoothstep
     e_0, e_1, direction = (wp.constant(real(value)) for value in (*EDGED, DIRECTION))
 
@@ -81,7 +82,8 @@ def edge_functions(precision: Precision, dimension: int, module: Any) -> SimpleN
 
 @cache
 def normal_part(discretisation: Discretisation) -> Any:
-    """Make the Warp function that projects a vector on the wall normal at the ``foot`` of a wall particle."""
+    """Make the Warp function that projects a vector on the normal of a wall. ``foot`` points from a wall particle to
+    the surface."""
     vector = discretisation.precision.vector
 
     @wp.func
@@ -93,7 +95,7 @@ def normal_part(discretisation: Discretisation) -> Any:
 
 @cache
 def beside_sums(discretisation: Discretisation) -> Kernels:
-    """Make the sums over walls beside a particle: normal, whole, nu and the drifts."""
+    """Make the sums over the walls beside a particle: gradients, coverage, and the divergence by moving walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -107,8 +109,6 @@ def beside_sums(discretisation: Discretisation) -> Kernels:
 
     @wall_sum(discretisation, typed, grows=beside)
     def beside_tangent(x_ij, x_dot_ij, v_j, v_dot_j, foot, turn_dot, s) -> tuple[vector, vector, real, real, real]:
-        """Return the tangent of a wall particle's terms: a turning wall turns its push, and ``rest`` is the remaining
-        motion."""
         rest = x_dot_ij - wp.cross(turn_dot, x_ij)
         whole, bent = s.volume * gradient(x_ij, s), s.volume * hessian_product(x_ij, rest, s)
         part = normal(whole, foot)
@@ -136,7 +136,7 @@ def _normal_work(d: Discretisation) -> Any:
 
 
 def beside_term(d: Discretisation) -> Any:
-    """Make the work function by which adjoints of the sums over walls act on solids."""
+    """Make the Warp function for the adjoints of solids, given adjoints of the sums over walls."""
     real, pair, normal = d.precision.real, pair_functions(d), normal_part(d)
     weight, gradient = pair.weight, pair.gradient
 
@@ -145,7 +145,6 @@ def beside_term(d: Discretisation) -> Any:
         x_ij, v_j, normal_bar_i, whole_bar_i, nu_bar_i, normal_drift_bar_i: real, whole_drift_bar_i: real, mirror_bar_i,
         behind_bar_i, sweep_bar_i, mirrored, foot, s,
     ) -> real:  # fmt: skip
-        """Return the work of these sums, also over mirroring walls, whose drift has the adjoint -``sweep_bar``."""
         whole, by_mirror = gradient(x_ij, s), mirrored * (mirror_bar_i - sweep_bar_i * v_j)
         part = wp.dot(normal(whole, foot), normal_bar_i + normal_drift_bar_i * v_j + by_mirror)
         part += wp.dot(whole, whole_bar_i + whole_drift_bar_i * v_j)
@@ -156,8 +155,7 @@ def beside_term(d: Discretisation) -> Any:
 
 @cache
 def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of gamma_s / V from the sums over a solid's walls and over all walls, without V; ``least`` is
-    0.05 a_0 / V^2."""
+    """Make the kernels of the force of a pressure on a solid."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
 
@@ -175,7 +173,7 @@ def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 
 
 class ProjectionPush:
-    """Sums along which pressures push walls: a `cortado.sph.density.WallAction`."""
+    """The action of walls on particles through pressures in the projection."""
 
     def __init__(self, system: ParticleSystem, constants: ProjectionConstants):
         discretisation, layout = system.discretisation, system.layout
@@ -198,7 +196,7 @@ class ProjectionPush:
         return found
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
-        """Add to the adjoints of positions and solids, given the adjoint of the total."""
+        """Add to the adjoints of positions and solids, given the adjoint ``total_bar`` of the action."""
         bars = self._arrays
         step.launch(self._kernels.adjoint, self._totals(step, solid), self._least, bars, push_bar=total_bar)
         for name, sums, over in self._each(solid):
@@ -216,18 +214,17 @@ class ProjectionPush:
 
     @cached_property
     def _arrays(self) -> dict[str, wp.array]:
-        """Make arrays on first use, because runs without derivatives need none."""
         names = "push", "push_dot", *(f"{name}_bar" for name, _, _ in self._each(ALL_WALLS))
         return self._layout.arrays(**dict.fromkeys(names, self._layout.precision.vector))
 
 
 NUMBERS = ("image", "density", "weighted", "spread", "swept", "k", "q")
-"""The adjoints h, b, c, d, e, k and q in W; B is the ``slope``."""
+"""Names of the arrays with adjoints of image sums."""
 
 
 @cache
 def face_share_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that turns adjoints of images into those of one solid, and through ``swept`` into that of x."""
+    """Make the kernel that converts adjoints of image sums to adjoints of a solid."""
     d = replace(discretisation, lanes=1, taped=True)
     precision = d.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
@@ -318,7 +315,7 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
 
 
 class FaceShares:
-    """The particles' contributions, through images, to the adjoints of solids."""
+    """Terms of particles in the adjoints of solids, through mirror images."""
 
     def __init__(self, system: ParticleSystem):
         self._kernel, self._faces = partial(face_share_kernel, system.discretisation), len(system.faces.solids)
@@ -329,8 +326,8 @@ class FaceShares:
     def add(
         self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: wp.array
     ) -> None:
-        """Add the contributions of images in all walls, or in those of the solid ``over``. Missing ``arrays`` of
-        adjoints are 0; ``groups`` contain h as ``image``."""
+        """Add the terms of images in all walls, or in the walls of the solid ``over``. Missing ``arrays``
+        count as 0."""
         if self._faces:
             known = {**self._nothing, **{name: array for group in groups for name, array in group.items()}, **arrays}
             bar.solids.add(context.launch, self._kernel, *bar.named, known, over=over)
@@ -342,8 +339,7 @@ def weights_type(precision: Precision) -> Any:
 
 
 def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -> TypesByName:
-    """Return the types of names in sums and kernels; other names are numbers. ``more`` has names that take
-    precedence."""
+    """Return the Warp types of the names in sums and kernels. Other names are numbers. ``more`` takes precedence."""
     common = {
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
