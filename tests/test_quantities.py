@@ -186,6 +186,7 @@ def test_a_trajectory_is_looked_at_frame_by_frame(name):
     ends = cortado.Problem(simulation, 7, Squares({name: 1.0})).states({"gravity": gravity}, [0, 3, 6, 7])
     for own, end in zip(found, ends.values(), strict=True):
         np.testing.assert_array_equal(own, end[name])
+    assert simulation.quantity(name, trajectory[:0]).shape[0] == 0
 
 
 @pytest.mark.parametrize("make", [plane, scene, two_layers])

@@ -307,7 +307,7 @@ class Simulation(Stepping):
         given = {key: value for key, value in (controls or {}).items() if key not in self.known.state}
         rows = {key: value for key, value in given.items() if key in OVER_TIME and np.ndim(value) == 2}
         found = []
-        for k, step in enumerate((of.steps - of.steps[0]).tolist()):
+        for k, step in enumerate((of.steps - of.steps[:1]).tolist()):
             now = {key: value[min(step, len(value) - 1)] for key, value in rows.items()}
             found.append(self._quantity(name, of[: k + 1].last_state, given | now))
         return np.array(found)

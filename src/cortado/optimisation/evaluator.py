@@ -196,7 +196,11 @@ class Evaluator:
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         """Return the loss and its gradient (size,) at a vector (size,)."""
         found = self._next(vector, self._compute)
-        assert found is not None
+        if found is None:
+            raise InputError(
+                f"Of the former run's evaluations, which {self.log.fate}, one has an infinite loss, but must have a "
+                "finite one for this optimiser: give another checkpoint folder."
+            )
         return found
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:

@@ -87,6 +87,12 @@ class MemoryLog(list[LoggedEvaluation]):
         """Do nothing: no file is open."""
 
 
+def _has_records(path: Path) -> bool:
+    with sentences(path), open(path, "rb") as file:
+        file.readline()
+        return bool(file.read(1))
+
+
 class ReplayLog:
     """A replay log in one file of a folder. A killed process loses at most the evaluation that it is writing.
 
@@ -96,7 +102,9 @@ class ReplayLog:
     next evaluation overwrites an incomplete last record.
     """
 
-    def __init__(self, folder: Path | str, layout: ParameterLayout, settings: Mapping[str, str], resume: bool):
+    def __init__(
+        self, folder: str | os.PathLike[str], layout: ParameterLayout, settings: Mapping[str, str], resume: bool
+    ):
         """Open the log in ``folder`` to ``resume`` a search, or begin a new log.
 
         Raises `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ from the
@@ -108,7 +116,7 @@ class ReplayLog:
         header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}
         if path.exists() and not path.is_file():
             raise InputError(f"'{path}' is no regular file; give another checkpoint folder.")
-        if not resume and path.exists() and len(path.read_bytes().splitlines()) > 1:
+        if not resume and path.exists() and _has_records(path):
             raise InputError(
                 f"'{path}' already holds the evaluations of an optimisation; go on with it by resume=True, or "
                 "give another checkpoint folder."

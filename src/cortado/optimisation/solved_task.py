@@ -85,7 +85,7 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
                 rank = made.task.known[name].rank
                 course = np.broadcast_to(true, (bijector.steps, *np.shape(true)[np.ndim(true) - rank :]))
                 true = bijector.coordinate(course)
-                if largest := np.abs(true).max():  # without round-off, and without -0
+                if (largest := np.abs(true).max()) > 0.0:  # without round-off, and without -0
                     true = np.round(true, 11 - int(np.floor(np.log10(largest)))) + 0.0
             times = (bijector.places + made.task.known[name].moment) * step
             found[name] = KnotValues(times, made.start[name], coordinates[name], true)

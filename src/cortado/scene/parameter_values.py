@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.arrays import as_numbers, require_table
+from cortado.calls import FixedDict
 from cortado.errors import InputError, OutOfRangeError, shown
 from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Source, names
 
@@ -100,17 +101,17 @@ class Tilt:
         return sine, np.where(size < SMALL, -1.0 / 3.0 + size**2 / 30.0 - size**4 / 840.0, derivative)
 
 
-class Known(dict[str, Parameter]):
+class Known(FixedDict):
     """Parameters by name: Cortado's parameters, and the parameters of a solver and of forces."""
 
-    __eq__, __hash__ = object.__eq__, object.__hash__  # type: ignore[assignment]
+    __eq__, __ne__, __hash__ = object.__eq__, object.__ne__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
         """Add the parameters ``own`` of forces and a solver, each with a description of the force or solver. Raises
         `InputError` if two parameters have the same name, or if a name is reserved. `TIME` may occur several times."""
-        super().__init__(BY_NAME)
-        arguments = {argument(name): name for name in BY_NAME}
-        for parameter, whose in dict(own).items():
+        self._given = dict(own)
+        found, arguments = dict(BY_NAME), {argument(name): name for name in BY_NAME}
+        for parameter, whose in self._given.items():
             name = parameter.name
             if argument(name) in arguments:
                 raise InputError(
@@ -118,7 +119,8 @@ class Known(dict[str, Parameter]):
                     f"have its own: give {whose.replace('a ', 'the ')} another name."
                 )
             arguments[argument(name)] = name
-            self[name] = parameter
+            found[name] = parameter
+        super().__init__(found)
         self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
         """Names of parameters of the time steps."""
@@ -130,6 +132,9 @@ class Known(dict[str, Parameter]):
         self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
         """Names of alternative parameters, such as a tilt, with the names of the parameters that they replace."""
         self.courses = {p.name: p.course for p in self.own if p.course is not None}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Known, (tuple(self._given.items()),)
 
     def has_rows(self, name: str, value: Any) -> bool:
         """Test if a value has an entry for each step or each given time."""

@@ -180,14 +180,18 @@ class LoopRecord(StepRecord):
     def read(self, steps: int) -> None:
         iterations, errors = self.values(steps)
         self.diagnostics = {self.loop.iterations_name: iterations.astype(int)}
+        self._count()
         for number, name in enumerate(self.loop.columns):
             self.diagnostics[name] = errors[..., number].astype(np.float64)
 
-    @property
-    def counts(self) -> NDArray:
-        """Return the number of iterations of each step (steps,); in a batch, the greatest number of all scenes."""
+    def assign(self, other: Self) -> None:
+        super().assign(other)
+        self._count()
+
+    def _count(self) -> None:
         found = self.diagnostics[self.loop.iterations_name]
-        return found if found.ndim == 1 else found.max(axis=1)
+        self.counts = found if found.ndim == 1 else found.max(axis=1)
+        """Number of iterations of each step (steps,). In a batch it is the greatest number of all scenes."""
 
     @property
     def converged(self) -> NDArray:
