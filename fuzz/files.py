@@ -20,7 +20,7 @@ PLANE = {
     "discretisation": {"spacing": 0.05},
     "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
     "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [0.7, 0.8]},
-    "solver": {"time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3},
+    "solver": {"time_step": 0.002},
 }
 READERS = (
     *("points.npy", "points.vtk", "points.vtp", "points.vtkhdf", "trajectory.vtkhdf", "picture.png"),
