@@ -114,7 +114,7 @@ class Affine:
     position."""
 
     def __init__(self, base: Any, matrix: Any):
-        """Store ``base``, in the shape and unit of the parameter, and a ``matrix`` of shape (*base.shape, *u.shape)."""
+        """Store ``base``, in the shape and unit of the parameter, and ``matrix`` with ``base.shape + u.shape``."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
