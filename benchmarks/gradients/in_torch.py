@@ -11,7 +11,7 @@ import cortado.torch
 class InTorch:
     """The operations of a loop on tensors."""
 
-    library, cat, stack, tanh, sin, cos = cortado.torch, torch.cat, torch.stack, torch.tanh, torch.sin, torch.cos
+    layers, cat, stack, tanh, sin, cos = cortado.torch, torch.cat, torch.stack, torch.tanh, torch.sin, torch.cos
     least = staticmethod(lambda x: x.amin(-1))
 
     @staticmethod

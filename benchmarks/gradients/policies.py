@@ -10,7 +10,7 @@ reward of an action in four test episodes, which nobody trains with and which do
     python -m benchmarks.gradients.policies --task carry --seeds 1 --steps 200 --budget 20000    # small, minutes
     python -m benchmarks.gradients.policies --task carry --processes 15                          # a core each
     python -m benchmarks.gradients.policies --task carry --method CEM --device cuda:0            # batches
-    python -m benchmarks.gradients.policies --task carry --library torch --method AdjointViscosity Exact
+    python -m benchmarks.gradients.policies --task carry --framework torch --method AdjointViscosity Exact
 """
 
 import argparse
@@ -53,7 +53,7 @@ Row = dict[str, Any]
 class InJax:
     """The operations of a loop on arrays of JAX."""
 
-    library, cat, stack, tanh, sin, cos = cortado.jax, jnp.concatenate, jnp.stack, jnp.tanh, jnp.sin, jnp.cos
+    layers, cat, stack, tanh, sin, cos = cortado.jax, jnp.concatenate, jnp.stack, jnp.tanh, jnp.sin, jnp.cos
     least = staticmethod(lambda x: x.min(-1))
     compiled = staticmethod(jax.jit)
 
@@ -124,7 +124,7 @@ class Loop:
 
     def loss(self, estimator: Any, xp: Any = InJax) -> Callable[[Any, Any], Any]:
         """Return the loss of weights (w,) and first positions (n, 2), differentiable by an estimator."""
-        task, simulation, first = self.task, self.simulation, xp.library.state(self.simulation)
+        task, simulation, first = self.task, self.simulation, xp.layers.state(self.simulation)
         driven = [Driven(xp, one, task.substeps, task.time_step) for one in task.actuators]
         (seen, said), rewarded = self.sizes, REWARDS[task.name](xp, task, simulation)
 
@@ -142,7 +142,7 @@ class Loop:
                 for one, actuator, was, part in zip(driven, task.actuators, now, parts, strict=True):
                     later, rows[actuator.parameter] = one(was, part)
                     after.append(later)
-                state = xp.library.step(simulation, state, rows, task.substeps, estimator)
+                state = xp.layers.step(simulation, state, rows, task.substeps, estimator)
                 return (state, after), rewarded(state)
 
             axes, zeros = [len(one.axes) for one in task.actuators], xp.array(np.zeros(2 * said))
@@ -295,7 +295,7 @@ class Job:
     steps: int
     budget: int
     device: str
-    library: str
+    framework: str
 
     def run(self) -> Row:
         """Return rewards of test episodes over the number of simulated steps."""
@@ -314,7 +314,7 @@ class Job:
         method = (
             CrossEntropy(loop, weights, random)
             if self.method == "CEM"
-            else Descent(loop, METHODS[self.method], weights, random, self.device, library(self.library))
+            else Descent(loop, METHODS[self.method], weights, random, self.device, operations(self.framework))
         )
         cost = 0.0
         while taken + cost <= self.budget:
@@ -327,8 +327,8 @@ class Job:
         return {**own, "steps": [at for at, _ in history], "rewards": [reward for _, reward in history]}
 
 
-def library(name: str) -> Any:
-    """Return the operations of a library on arrays: "jax" or "torch"."""
+def operations(name: str) -> Any:
+    """Return the operations of a framework on arrays: "jax" or "torch"."""
     if name == "jax":
         return InJax
     from benchmarks.gradients.in_torch import InTorch
@@ -385,12 +385,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=800, help="simulated steps of an episode")
     parser.add_argument("--budget", type=int, default=112_000, help="simulated steps of a training")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--library", choices=["jax", "torch"], default="jax", help="of the gradients")
+    parser.add_argument("--framework", choices=["jax", "torch"], default="jax", help="of the gradients")
     parser.add_argument("--processes", type=int, default=1, help="more than 1: a seed and method at a time in each")
     parser.add_argument("--out", type=Path, default=Path("runs/policies"), help="files of former calls are kept")
     asked = parser.parse_args()
     each = [(task, method, seed) for task in asked.task for method in asked.method for seed in asked.seeds]
-    jobs = [Job(*own, asked.steps, asked.budget, asked.device, asked.library) for own in each]
+    jobs = [Job(*own, asked.steps, asked.budget, asked.device, asked.framework) for own in each]
     asked.out.mkdir(parents=True, exist_ok=True)
     if asked.processes > 1:
         os.environ.setdefault("CORTADO_CORES", "1")

@@ -272,7 +272,7 @@ class NamedStates(HostStates):
         found = {name: _copy(on_host(array) if name in doubles else array) for name, array in views}
         for b, number in lost.items():
             for array in found.values():
-                member = array if self._simulation.batch is None else array[b]
+                member = array[b]
                 member.fill(number) if isinstance(member, np.ndarray) else member.fill_(number)
         return found
 
