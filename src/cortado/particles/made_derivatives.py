@@ -20,18 +20,7 @@ import warp as wp
 
 from cortado.device.precision import Precision
 from cortado.particles.neighbourhood import Discretisation
-from cortado.particles.pair_sums import (
-    NUMBERS,
-    Body,
-    Term,
-    Types,
-    array_of,
-    over_fluid,
-    own_entry,
-    summed,
-    type_name,
-    zero,
-)
+from cortado.particles.pair_sums import Term, array_of, between, over_fluid, own_entry, summed, type_name, zero
 
 TermMaker = Callable[[Discretisation], Callable[..., Any]]
 
@@ -41,19 +30,55 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
     the adjoints of the sums. The function returns the adjoints of particle i's entry of each array, and of ``others``.
     """
     term = _differentiable(make, d)
-    arrays = {**term.arrays, **bars_of(term)}
-    loop = over_fluid(d, arrays, _adjoint(term), ahead=True, numbered="j" in term.parameters)
-    return _made(term, d, arrays, term.others, (*term.arrays.values(), *term.others.values()), loop, module)
+    bars, results = bars_of(term), (*term.arrays.values(), *term.others.values())
+
+    def body(of_j: Mapping[str, str]) -> Iterator[str]:
+        yield _gradient("own", term, term.seen_from_i(of_j), map(own_entry, bars))
+        yield _gradient("other", term, term.seen_from_i(of_j, back=True), (of_j[bar] for bar in bars))
+        for n, array in enumerate(term.arrays):
+            shares = {
+                f"{array}_i": f"_own_{array}_i",
+                f"{array}_j": f"_other_{array}_j",
+                f"{array}_ij": f"_own_{array}_ij - _other_{array}_ij",
+            }
+            yield f"_total_{n} += {' + '.join(share for name, share in shares.items() if name in term.parameters)}"
+        for n, name in enumerate(term.others, len(term.arrays)):
+            yield f"_total_{n} += _own_{name}"
+
+    arrays = {**term.arrays, **bars}
+    return _made(term, d, arrays, term.others, results, over_fluid(term, d, True, arrays, body), module)
 
 
 def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
     """Make the Warp function of the tangent of a sum over neighbours. Each argument is followed by its tangent."""
     term = _differentiable(make, d)
-    arrays, others = _with_tangents(term.arrays), _with_tangents(term.others)
+    arrays, others = (
+        {each: kind for name, kind in types.items() for each in (name, f"{name}_dot")}
+        for types in (term.arrays, term.others)
+    )
     if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
         raise TypeError(f"term {term.name} has a name and the same with _dot, but tangents have such names.")
-    loop = over_fluid(d, arrays, _tangent(term, d), ahead=False, numbered="j" in term.parameters)
-    return _made(term, d, arrays, others, term.results, loop, module)
+    kinds, real = {**term.parameters, **bars_of(term)}, d.precision.real
+    moved = [name for name in term.parameters if name not in ("i", "j", "s")]
+
+    def unit(kind: Any, k: int) -> str:
+        ones = ", ".join(f"_real({float(m == k)})" for m in range(1 if kind is real else len(kind())))
+        return ones if kind is real else f"{type_name(kind, d)}({ones})"
+
+    def product(by: str, name: str, of_j: Mapping[str, str]) -> str:
+        dot = f"{array_of(name)}_dot"
+        change = between(name, own_entry(dot), of_j[dot]) if array_of(name) else f"{name}_dot"
+        return f"{by} * ({change})" if kinds[name] is real else f"_wp.{dot_of(kinds[name])}({by}, {change})"
+
+    def body(of_j: Mapping[str, str]) -> Iterator[str]:
+        for n, kind in enumerate(term.results):
+            for k in range(1 if kind is real else len(kind())):
+                bars = [unit(each, k) if m == n else zero(each, d) for m, each in enumerate(term.results)]
+                yield _gradient(f"by_{n}_{k}", term, term.seen_from_i(of_j), bars)
+                terms = (product(f"_by_{n}_{k}_{name}", name, of_j) for name in moved)
+                yield f"_total_{n} += ({' + '.join(terms)}) * {unit(kind, k)}"
+
+    return _made(term, d, arrays, others, term.results, over_fluid(term, d, False, arrays, body), module)
 
 
 def _differentiable(make: TermMaker, d: Discretisation) -> Term:
@@ -64,12 +89,11 @@ def _differentiable(make: TermMaker, d: Discretisation) -> Term:
 
 
 def _made(
-    term: Term, d: Discretisation, arrays: Types, others: Types, results: Iterable[Any], loop: str, module: Any
+    term: Term, d: Discretisation, arrays: dict[str, Any], others: dict[str, Any], results: Any, loop: str, module: Any
 ) -> Any:
     module = module or wp.get_module(term.function.__module__)
-    return summed(
-        term.name, d, arrays, others, results, loop, {"_work": work_of(term, d.precision, module), "_wp": wp}, module
-    )
+    scope = {"_work": work_of(term, d.precision, module), "_wp": wp}
+    return summed(term.name, d, arrays, others, results, loop, scope, module)
 
 
 def work_of(term: Term, precision: Precision, module: Any) -> Any:
@@ -105,61 +129,6 @@ def bars_of(term: Term) -> dict[str, Any]:
     return {f"_bar_{n}": kind for n, kind in enumerate(term.results)}
 
 
-def _with_tangents(types: Types) -> dict[str, Any]:
-    return {each: kind for name, kind in types.items() for each in (name, f"{name}_dot")}
-
-
 def _gradient(label: str, term: Term, arguments: str, bars: Iterable[str]) -> str:
     names = ", ".join(f"_{label}_{name}" for name in (*term.parameters, *bars_of(term)))
     return f"{names} = _wp.grad(_work)({arguments}, {', '.join(bars)})"
-
-
-def _adjoint(term: Term) -> Body:
-    def body(of_j: Mapping[str, str]) -> Iterator[str]:
-        yield _gradient("own", term, term.seen_from_i(of_j), map(own_entry, bars_of(term)))
-        yield _gradient("other", term, term.seen_from_j(of_j), (of_j[bar] for bar in bars_of(term)))
-        for n, array in enumerate(term.arrays):
-            shares = {
-                f"{array}_i": f"_own_{array}_i",
-                f"{array}_j": f"_other_{array}_j",
-                f"{array}_ij": f"_own_{array}_ij - _other_{array}_ij",
-            }
-            yield f"_total_{n} += {' + '.join(share for name, share in shares.items() if name in term.parameters)}"
-        for n, name in enumerate(term.others, len(term.arrays)):
-            yield f"_total_{n} += _own_{name}"
-
-    return body
-
-
-def _tangent(term: Term, d: Discretisation) -> Body:
-    kinds = {**term.parameters, **bars_of(term)}
-
-    def change_of(name: str, of_j: Mapping[str, str]) -> str:
-        array = array_of(name)
-        if not array:
-            return f"{name}_dot"
-        own, other = own_entry(f"{array}_dot"), of_j[f"{array}_dot"]
-        return {"i": own, "j": other, "ij": f"{own} - {other}"}[name.rpartition("_")[2]]
-
-    def product(first: str, name: str, second: str) -> str:
-        if kinds[name] is d.precision.real:
-            return f"{first} * ({second})"
-        return f"_wp.{dot_of(kinds[name])}({first}, {second})"
-
-    def body(of_j: Mapping[str, str]) -> Iterator[str]:
-        moved = [name for name in term.parameters if name not in (*NUMBERS, "s")]
-        for n, kind in enumerate(term.results):
-            components = 1 if kind is d.precision.real else len(kind())
-            for k in range(components):
-                bars = [_unit(each, d, k) if m == n else zero(each, d) for m, each in enumerate(term.results)]
-                yield _gradient(f"by_{n}_{k}", term, term.seen_from_i(of_j), bars)
-                terms = (product(f"_by_{n}_{k}_{name}", name, change_of(name, of_j)) for name in moved)
-                yield f"_total_{n} += ({' + '.join(terms)}) * {_unit(kind, d, k)}"
-
-    return body
-
-
-def _unit(kind: Any, d: Discretisation, k: int) -> str:
-    if kind is d.precision.real:
-        return "_real(1.0)"
-    return f"{type_name(kind, d)}({', '.join(f'_real({float(m == k)})' for m in range(len(kind())))})"

@@ -176,8 +176,7 @@ class MovingWalls:
     """The wall particles of moving solids."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
-        """Take the ``walls`` of ``solids`` moving solids. In the arrays of the neighbour search they are numbered from
-        ``first`` on."""
+        """Take the ``walls`` of ``solids`` moving solids, numbered from ``first`` on in the neighbour search."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
         self.sizes = sizes_type(precision)()
@@ -209,8 +208,7 @@ class MovingWalls:
         self.grid.starts = wp.zeros_like(self._sort.grid.starts)
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write the wall particles to the arrays of a neighbour search. ``time_step`` (members,) is the length of the
-        time step [s]."""
+        """Write the wall particles to the arrays of a neighbour search, for a ``time_step`` (members,) [s]."""
         place, write, shift, _ = self._kernels
         launch(place, self._all, self._device, self._own, self.named)
         self._sort(self._own["x"])
@@ -220,6 +218,6 @@ class MovingWalls:
         launch(write, self._all, self._device, self._own, self.named, known, walls)
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
-        lengths = {"time_step": time_step, "time_step_dot": time_step_dot}
-        known = {"first": self._first, "order": self._sort.order, **lengths}
+        known = {"first": self._first, "order": self._sort.order}
+        known |= {"time_step": time_step, "time_step_dot": time_step_dot}
         launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)

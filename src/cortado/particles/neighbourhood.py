@@ -305,10 +305,6 @@ def pair_functions(discretisation: Discretisation) -> SimpleNamespace:
 
     of_kernel = by_name(weight, slope, slope_change, slope_gradient, gradient, hessian_product)
     own = by_name(per_size, factor, factor_gradient, neighbour, several, vectors, numbers, sixes)
-    return SimpleNamespace(
-        separation=nearest_image if discretisation.periodic else difference,
-        **vars(of_kernel),
-        **vars(own),
-        **vars(load),
-        **mirror_functions(discretisation.precision, discretisation.moving, neighbourhood),
-    )
+    of_mirrors = mirror_functions(discretisation.precision, discretisation.moving, neighbourhood)
+    separation = nearest_image if discretisation.periodic else difference
+    return SimpleNamespace(separation=separation, **vars(of_kernel), **vars(own), **vars(load), **of_mirrors)

@@ -121,13 +121,9 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
     return scan
 
 
-def scan_around(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends neighbours in the cells around cell c."""
-    return (scan_at_once if discretisation.lanes >= LEAST_AT_ONCE else scan_by_rows)(discretisation)
-
-
 @cache
 def scan_by_rows(discretisation: Discretisation) -> Any:
+    """Make the Warp function that appends neighbours in the cells around cell c."""
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     scan = scan_by_bits(discretisation) if discretisation.lanes == 1 else scan_by_lanes(discretisation)
@@ -220,7 +216,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
     kinds = {neighbourhood: "s", cell_grid_type(precision): "grid wall_grid moving_grid", wp.bool: "near_walls"}
     typed = TypesByName(wp.int32, {**kinds, vector: "x"})
     cell_of = cell_functions(precision).cell_of
-    scan = scan_around(discretisation)
+    scan = (scan_at_once if discretisation.lanes >= LEAST_AT_ONCE else scan_by_rows)(discretisation)
     LANES, lane = discretisation.lanes, discretisation.lane
 
     @typed.kernel(discretisation.module(True, "neighbours"), enable_backward=False)
@@ -301,14 +297,6 @@ def image_kernel(discretisation: Discretisation) -> Any:
     return fill_images
 
 
-def _near_walls(grid: Grid, starts: np.ndarray) -> np.ndarray:
-    """Return a mask (cells,) of cells with walls inside or around them."""
-    near = np.diff(starts).reshape(grid.shape[::-1]) > 0
-    for axis in range(3):
-        near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
-    return near.ravel()
-
-
 class NeighbourSearch:
     """A search that sorts particles by cell and lists their neighbours on one device.
 
@@ -378,9 +366,15 @@ class NeighbourSearch:
 
     def sort(self, positions: wp.array) -> None:
         """Sort positions (members * n,) [m] by cell, and write the order to ``order``. The sort is stable."""
-        if self._unsorted_walls is not None:  # once, and not before kernels are compiled side by side
-            self._sort_walls(self._unsorted_walls)
-            self._unsorted_walls = None
+        walls, self._unsorted_walls = self._unsorted_walls, None
+        if walls is not None:  # once, and not before kernels are compiled side by side
+            dtype = self.walls["wall_positions"].dtype
+            self._wall_sort(wp.array(walls.positions, dtype=dtype, device=self.device))
+            self._write_walls(walls.some(self._wall_sort.order.numpy()))
+            near = np.diff(self._wall_sort.grid.starts.numpy()).reshape(self._grid.shape[::-1]) > 0
+            for axis in range(3):
+                near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+            self._near_walls.assign(near.ravel())  # cells with walls inside or around them
         self._sort(positions)
 
     def _write_walls(self, walls: WallArrays) -> None:
@@ -389,12 +383,6 @@ class NeighbourSearch:
             array = self.walls[f"wall_{name}"]
             if len(values):
                 wp.copy(array, wp.array(values, dtype=array.dtype, device=self.device), count=len(values))
-
-    def _sort_walls(self, walls: WallArrays) -> None:
-        dtype = self.walls["wall_positions"].dtype
-        self._wall_sort(wp.array(walls.positions, dtype=dtype, device=self.device))
-        self._write_walls(walls.some(self._wall_sort.order.numpy()))
-        self._near_walls.assign(_near_walls(self._grid, self._wall_sort.grid.starts.numpy()))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
         """List the neighbours of sorted positions (members * n,) [m]. Scenes whose ``bad_step`` (members,) is not -1

@@ -33,6 +33,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, get_args
 
 import warp as wp
@@ -84,37 +85,33 @@ class Term:
         known = (*NUMBERS, *OF_WALLS, *OF_IMAGES, "s")
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
-    def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j") -> str:
-        return self._arguments("_x_ij", own_entry, of_j.__getitem__, {"i": "i", "j": j, **OF_WALLS, **OF_IMAGES})
-
-    def seen_from_j(self, of_j: Mapping[str, str]) -> str:
-        return self._arguments("-_x_ij", of_j.__getitem__, own_entry, {"i": "_j", "j": "i"})
-
-    def _arguments(
-        self, separation: str, own: Callable[[str], str], other: Callable[[str], str], numbers: Mapping[str, str]
-    ) -> str:
-        def argument(name: str) -> str:
-            array = array_of(name)
-            if name == "x_ij":
-                return separation
-            if not array:
-                return numbers.get(name, name)
-            if name.endswith("_ij"):
-                return f"{own(array)} - {other(array)}"
-            return own(array) if name.endswith("_i") else other(array)
-
-        return ", ".join(map(argument, self.parameters))
+    def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j", back: bool = False) -> str:
+        """Return the arguments of the term for particle i and its neighbour, or, ``back``, for the neighbour and i."""
+        known = {"x_ij": "_x_ij", "i": "i", "j": j, **OF_WALLS, **OF_IMAGES}
+        if back:
+            known = {"x_ij": "-_x_ij", "i": "_j", "j": "i"}
+        found = []
+        for name in self.parameters:
+            ends = own_entry(array_of(name)), of_j.get(array_of(name), "")
+            own, other = reversed(ends) if back else ends
+            found.append(known.get(name) or between(name, own, other))
+        return ", ".join(found)
 
 
 def array_of(parameter: str) -> str:
-    """Return the name of the array for a parameter such as ``c_i``, or an empty text for a parameter without
-    an array."""
+    """Return the name of the array for a parameter such as ``c_i``, or an empty text without an array."""
     array, _, index = parameter.rpartition("_")
     return array if index in INDICES else ""
 
 
 def own_entry(array: str) -> str:
     return f"_{array}_i"
+
+
+def between(parameter: str, own: str, other: str) -> str:
+    """Return the text of a parameter, given the texts of the array's entries of the particle and its neighbour."""
+    texts = {"i": own, "j": other, "ij": f"{own} - {other}"}
+    return texts[parameter.rpartition("_")[2]] if array_of(parameter) else parameter
 
 
 SUM = """\
@@ -142,33 +139,34 @@ OVER_WALLS = """\
 ALL, RUBBING = "_load_number(s.wall_weights, _b)", "_load_number(s.wall_grips, _b)"
 PLACE, FOOT = "_load_vector(s.wall_positions, _b)", "_load_vector(s.wall_feet, _b)"
 TURN, GROWTH = "_load_vector(s.wall_turns_dot, _b)", "_load_number(s.wall_growths_dot, _b)"
-MOVING = {
-    "v": "_load_vector(s.wall_velocities, _b)",
-    "x_dot": "_load_vector(s.wall_positions_dot, _b)",
-    "v_dot": "_load_vector(s.wall_velocities_dot, _b)",
-}
+MOVING = {"v": "velocities", "x_dot": "positions_dot", "v_dot": "velocities_dot"}
+MOVING = {name: f"_load_vector(s.wall_{array}, _b)" for name, array in MOVING.items()}
 
 Function = Callable[..., Any]
+Kinds = tuple[Any, ...]
 Decorator = Callable[[Function], Any]
 Types = Mapping[str, Any]
+Typed = TypesByName | None
 Body = Callable[[Mapping[str, str]], Iterable[str]]
+Loops = Callable[[Term, Term], str]
 
 
 def over_fluid(
-    d: Discretisation, arrays: Types, body: Body, ahead: bool, numbered: bool, separated: bool = True
+    term: Term, d: Discretisation, ahead: bool, arrays: Types | None = None, body: Body | None = None
 ) -> str:
-    """Return the source text of a loop over fluid neighbours that reads the entries of ``arrays``.
+    """Return the text of a loop over fluid neighbours that reads ``arrays``. By default it adds up the term.
 
     ``ahead`` loads the entries of `UNROLL` neighbours before using any of them.
     """
+    arrays, body = arrays or term.of_neighbours, body or _adding_up(term)
     kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
     loads = kinds if ahead else {}
     loaded = {array: loads[kind] for array, kind in arrays.items() if kind in loads}
     of_j = {array: f"_{array}_j[_more]" if array in loaded else f"{array}[_j]" for array in arrays}
     return OVER_FLUID.format(
         load=_lines(8, (f"_{array}_j = {load}({array}, _several_j)" for array, load in loaded.items())),
-        index="_j = _several_j[_more]" if numbered or len(loaded) < len(arrays) else "",
-        separation=f"_x_ij = _separation(_x_i, {of_j['x']}, s)" if separated else "",
+        index="_j = _several_j[_more]" if "j" in term.parameters or len(loaded) < len(arrays) else "",
+        separation=f"_x_ij = _separation(_x_i, {of_j['x']}, s)" if "x_ij" in term.parameters else "",
         body=_lines(12, body(of_j)),
     )
 
@@ -188,31 +186,27 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
     return OVER_IMAGES.format(body=_lines(8, body({array: of_j(array, kind) for array, kind in arrays.items()})))
 
 
-def over_walls(d: Discretisation, arrays: Types, body: Body, known: Iterable[str], weight: str) -> str:
-    """Return the source text of a loop over wall particles."""
+def over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
+    """Return the source text of a loop over wall particles that adds up a term."""
+    if "x_ij" not in wall.parameters:
+        raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
+    arrays = wall.of_neighbours
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
-    of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays}
+    of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays} | {"x": PLACE}
     turned = TURN if d.moving else zero(d.precision.vector, d)
     more = {"foot": f"_foot = {FOOT}", "turn_dot": f"_turn_dot = {turned}"}
-    return OVER_WALLS.format(
-        weight=weight,
-        more=_lines(8, (text for name, text in more.items() if name in known)),
-        body=_lines(8, body({**of_b, "x": PLACE})),
-    )
+    lines = _added("_wall_term", wall, "_w_b * ", wall.seen_from_i(of_b, "-1"))
+    if grows is not None and d.moving:
+        grown = _added("_grown_term", grows.wall, "_w_b * _growth * ", grows.wall.seen_from_i(of_b, "-1"))
+        lines += [f"_growth = {GROWTH}", "if _growth != _real(0.0):", *(f"    {line}" for line in grown)]
+    told = _lines(8, (text for name, text in more.items() if name in wall.parameters))
+    return OVER_WALLS.format(weight=weight, more=told, body=_lines(8, lines))
 
 
 def summed(
-    name: str,
-    d: Discretisation,
-    arrays: Types,
-    others: Types,
-    results: Iterable[Any],
-    loops: str,
-    scope: Types,
-    module: Any,
+    name: str, d: Discretisation, arrays: Types, others: Types, results: Kinds, loops: str, scope: Types, module: Any
 ) -> Any:
     """Make the Warp function ``name(i, *arrays, *others, s)``, which runs ``loops`` and returns the sums."""
-    results = tuple(results)
     for kind in results:
         if kind is not d.precision.real and not _is_vector_of(d.precision.real, kind):
             raise TypeError(f"{name} returns {kind}, but a sum must be of numbers or vectors of the precision.")
@@ -258,8 +252,7 @@ def zero(kind: Any, d: Discretisation) -> str:
 
 
 def type_name(kind: Any, d: Discretisation) -> str:
-    known = {d.precision.real: "_real", d.precision.vector: "_vector"}
-    return known.get(kind) or f"_vector_{len(kind())}"
+    return {d.precision.real: "_real", d.precision.vector: "_vector"}.get(kind) or f"_vector_{len(kind())}"
 
 
 def _lines(indent: int, lines: Iterable[str]) -> str:
@@ -267,12 +260,7 @@ def _lines(indent: int, lines: Iterable[str]) -> str:
 
 
 def _summing(
-    d: Discretisation,
-    typed: TypesByName | None,
-    loops: Callable[[Term, Term], str],
-    walls: Function | None = None,
-    module: Any = None,
-    grows: Any = None,
+    d: Discretisation, typed: Typed, loops: Loops, walls: Any = None, module: Any = None, grows: Any = None
 ) -> Decorator:
     def make(function: Function) -> Any:
         function = typed(function) if typed else function
@@ -288,12 +276,7 @@ def _summing(
 
 
 def pair_sum(
-    d: Discretisation,
-    typed: TypesByName | None = None,
-    walls: Function | None = None,
-    ahead: bool = True,
-    rubs: bool = False,
-    grows: Any = None,
+    d: Discretisation, typed: Typed = None, walls: Any = None, ahead: bool = True, rubs: bool = False, grows: Any = None
 ) -> Decorator:
     """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
 
@@ -302,18 +285,22 @@ def pair_sum(
     """
 
     def loops(term: Term, wall: Term) -> str:
-        _check_walls(wall, term)
-        return _over_fluid(term, d, ahead) + _over_walls(wall, d, grows, RUBBING if rubs else ALL)
+        own = term.arrays | term.others
+        more = [name for name, kind in (wall.arrays | wall.others).items() if own.get(name) != kind]
+        if wall.results != term.results or more:
+            found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
+            raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
+        return over_fluid(term, d, ahead) + over_walls(wall, d, grows, RUBBING if rubs else ALL)
 
     return _summing(d, typed, loops, walls, grows=grows)
 
 
-def fluid_sum(d: Discretisation, typed: TypesByName | None = None, ahead: bool = True, module: Any = None) -> Decorator:
+def fluid_sum(d: Discretisation, typed: Typed = None, ahead: bool = True, module: Any = None) -> Decorator:
     """Return a decorator that turns the term of a pair into its sum over fluid neighbours."""
-    return _summing(d, typed, lambda term, _: _over_fluid(term, d, ahead), module=module)
+    return _summing(d, typed, lambda term, _: over_fluid(term, d, ahead), module=module)
 
 
-def image_sum(d: Discretisation, typed: TypesByName | None = None) -> Decorator:
+def image_sum(d: Discretisation, typed: Typed = None) -> Decorator:
     """Return a decorator that turns the term of a pair into its sum over the mirror images of the fluid."""
     return _summing(d, typed, lambda term, _: over_images(d, term.of_neighbours, _adding_up(term)))
 
@@ -327,8 +314,7 @@ def image_sum_of_solid(total: Any) -> Any:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """Return a decorator factory for sums with friction. If fluid ``sticks`` to walls, the sum includes walls without
-    slip."""
+    """Return a decorator factory for sums with friction, over walls without slip too if fluid ``sticks`` to walls."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, None, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, None, ahead)
@@ -336,25 +322,17 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
     return summed
 
 
-def wall_sum(d: Discretisation, typed: TypesByName | None = None, grows: Any = None, weight: str = ALL) -> Decorator:
-    """Return a decorator that turns a term into its sum over wall particles. ``weight`` is the source text of the
-    weight."""
-    return _summing(d, typed, lambda _, wall: _over_walls(wall, d, grows, weight), grows=grows)
+def wall_sum(d: Discretisation, typed: Typed = None, grows: Any = None, weight: str = ALL) -> Decorator:
+    """Return a decorator that turns a term into its sum over wall particles, with the source text of the weight."""
+    return _summing(d, typed, lambda _, wall: over_walls(wall, d, grows, weight), grows=grows)
 
 
-def solid_sum(d: Discretisation, typed: TypesByName | None = None) -> Decorator:
+def solid_sum(d: Discretisation, typed: Typed = None) -> Decorator:
     return wall_sum(d, typed, weight=f"wp.where(s.wall_solids[_b] == solid, {ALL}, _real(0.0))")
 
 
-def mirror_sum(d: Discretisation, typed: TypesByName | None = None, grows: Any = None) -> Decorator:
+def mirror_sum(d: Discretisation, typed: Typed = None, grows: Any = None) -> Decorator:
     return wall_sum(d, typed, grows, f"wp.where(_mirrors_in(_b, mirrors, s), {ALL}, _real(0.0))")
-
-
-def _check_walls(wall: Term, term: Term) -> None:
-    more = [name for name, kind in (wall.arrays | wall.others).items() if (term.arrays | term.others).get(name) != kind]
-    if wall.results != term.results or more:
-        found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
-        raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
 
 
 def _adding_up(term: Term, weight: str = "") -> Body:
@@ -365,24 +343,6 @@ def _added(called: str, term: Term, weight: str, arguments: str) -> list[str]:
     numbers = range(len(term.results))
     call = f"{', '.join(f'_term_{n}' for n in numbers)} = {called}({arguments})"
     return [call, *(f"_total_{n} += {weight}_term_{n}" for n in numbers)]
-
-
-def _over_fluid(term: Term, d: Discretisation, ahead: bool) -> str:
-    knows = ("j" in term.parameters, "x_ij" in term.parameters)
-    return over_fluid(d, term.of_neighbours, _adding_up(term), ahead, *knows)
-
-
-def _over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
-    def body(of_b: Mapping[str, str]) -> list[str]:
-        lines = _added("_wall_term", wall, "_w_b * ", wall.seen_from_i(of_b, "-1"))
-        if grows is None or not d.moving:
-            return lines
-        grown = _added("_grown_term", grows.wall, "_w_b * _growth * ", grows.wall.seen_from_i(of_b, "-1"))
-        return [*lines, f"_growth = {GROWTH}", "if _growth != _real(0.0):", *(f"    {line}" for line in grown)]
-
-    if "x_ij" not in wall.parameters:
-        raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
-    return over_walls(d, wall.of_neighbours, body, wall.parameters, weight)
 
 
 @dataclass(frozen=True)
@@ -398,14 +358,12 @@ class ByHand:
 BY_HAND: list[ByHand] = []
 
 
-def tangent_of(sum_of: Any) -> Callable[[Any], Any]:
-    return lambda function: _noted("tangent", sum_of, function)
+def _noted(kind: str, sum_of: Any) -> Callable[[Any], Any]:
+    def note(function: Any) -> Any:
+        BY_HAND.append(ByHand(kind, sum_of, function))
+        return function
+
+    return note
 
 
-def adjoint_of(sum_of: Any) -> Callable[[Any], Any]:
-    return lambda function: _noted("adjoint", sum_of, function)
-
-
-def _noted(kind: str, sum_of: Any, function: Any) -> Any:
-    BY_HAND.append(ByHand(kind, sum_of, function))
-    return function
+tangent_of, adjoint_of = partial(_noted, "tangent"), partial(_noted, "adjoint")

@@ -42,6 +42,10 @@ from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import Term, array_of
 
 Types = Mapping[str, Any]
+Names = Collection[str]
+Modules = Sequence[Any]
+Typed = TypesByName | None
+Maker = Callable[[Any], Callable[..., Any]]
 KERNEL = """\
 def {name}({parameters}):
     {body}
@@ -96,12 +100,7 @@ def dotted(names: Mapping[str, str]) -> dict[str, str]:
 
 
 def particle_kernel(
-    module: Any,
-    results: str,
-    sums: Sequence[Over] = (),
-    numbers: Collection[str] = (),
-    name: str | None = None,
-    typed: TypesByName | None = None,
+    module: Any, results: str, sums: Sequence[Over] = (), numbers: Names = (), name: str = "", typed: Typed = None
 ) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that turns a function of one particle into a kernel in a Warp module. ``results`` are the
     names of the arrays that the kernel writes, separated by spaces."""
@@ -110,69 +109,50 @@ def particle_kernel(
         function = typed(function) if typed else function
         term, places = Term.of(function), function.__qualname__.split(".")
         called = sub(r"\W", "", "__".join((*places[:-1], name or places[-1])))  # as Warp calls kernels
-        totals = {total for one in sums for total in one.names}
-        arguments = _Arguments([*sums], numbers)
-        given = [
-            f"_{each}" if each in totals else arguments.entry(each, kind) for each, kind in term.parameters.items()
-        ]
+        totals, of = {total for one in sums for total in one.names}, _Arguments([*sums], numbers)
+        given = [f"_{each}" if each in totals else of.entry(each, kind) for each, kind in term.parameters.items()]
         found = [f"_found_{n}" for n in range(len(term.results))]
         lines = [f"{', '.join(found)} = _function({', '.join(given)})"]
         writes = zip(results.split(), found, term.results, strict=True)
-        return arguments.kernel(called, lines, writes, {"_function": wp.func(function, module=module)}, module)
+        return of.kernel(called, lines, writes, {"_function": wp.func(function, module=module)}, module)
 
     return make
 
 
 def sum_kernel(
-    name: str,
-    module: Any,
-    results: str,
-    total: Any,
-    times: str = "",
-    per: str = "",
-    numbers: Collection[str] = (),
-    **renamed: str,
+    name: str, module: Any, arrays: str, total: Any, times: str = "", per: str = "", numbers: Names = (), **renamed: str
 ) -> Any:
-    """Make the kernel of a sum over neighbours. The sum is multiplied by the source text ``times`` and divided by the
-    source text ``per``."""
+    """Make the kernel that writes a sum over neighbours to ``arrays``. The sum is multiplied by the source text
+    ``times`` and divided by the source text ``per``."""
     arguments = _Arguments([Over(total, [f"total_{n}" for n in range(len(total.results))], renamed)], numbers)
     for number in numbers:
         arguments.entry(number, total.discretisation.precision.real)
     values = (f"{times} * _total_{n}" if times else f"_total_{n}" for n in range(len(total.results)))
     values = (f"{value} / {per}" if per else value for value in values)
-    writes = zip(results.split(), values, total.results, strict=True)
+    writes = zip(arrays.split(), values, total.results, strict=True)
     return arguments.kernel(f"{MADE}{name}", [], writes, {}, module)
 
 
 def sum_kernels(
-    name: str,
-    modules: Sequence[Any],
-    sums: Sequence[Any],
-    result: str,
-    before: str = "",
-    times: str = "",
-    per: str = "",
-    numbers: Collection[str] = (),
-    written: Collection[str] = (),
-    **renamed: str,
+    name: str, modules: Modules, sums: Sequence[Any], result: str, before: str = "", written: Names = (), **named: Any
 ) -> Kernels:
     """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, in three Warp ``modules``.
 
-    The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``. ``before`` is an array, and ``times``
-    and ``per`` are source texts. Adjoints are added to the adjoints of the inputs, except for ``written`` arrays, which
-    are overwritten.
+    The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``. ``before`` is an array. Adjoints are
+    added to the adjoints of the inputs, except for ``written`` arrays, which are overwritten. ``named`` are the other
+    arguments of `sum_kernel`.
     """
     total, tangent, adjoint = sums
-    told = {**renamed, **dotted(renamed)}
+    told = named | dotted({each: other for each, other in named.items() if each not in ("times", "per", "numbers")})
+    numbers = named.get("numbers", ())
     known = [*total.arrays, *(name for name in total.others if name not in numbers)][: len(adjoint.results)]
     backs = (f"{'' if name in written else '+'}{told.get(name, name)}_bar" for name in known)
     bar = next(name for name in adjoint.arrays if name not in total.arrays)
     onto, onto_dot = (f":{before}{end}" if before else "" for end in ("", "_dot"))
-    scaled: dict[str, Any] = {"times": times, "per": per, "numbers": numbers, **told}
     return Kernels(
-        sum_kernel(name, modules[0], f"{result}{onto}", total, **scaled),
-        sum_kernel(f"{name}_tangent", modules[1], f"{result}_dot{onto_dot}", tangent, **scaled),
-        sum_kernel(f"{name}_adjoint", modules[2], " ".join(backs), adjoint, **{**scaled, bar: f"{result}_bar"}),
+        sum_kernel(name, modules[0], f"{result}{onto}", total, **told),
+        sum_kernel(f"{name}_tangent", modules[1], f"{result}_dot{onto_dot}", tangent, **told),
+        sum_kernel(f"{name}_adjoint", modules[2], " ".join(backs), adjoint, **{**told, bar: f"{result}_bar"}),
     )
 
 
@@ -185,13 +165,11 @@ def _arrays(read: Types, written: Types, taped: bool) -> tuple[dict[str, Any], l
 
 
 class _Arguments:
-    def __init__(self, sums: Sequence[Over], numbers: Collection[str]):
+    def __init__(self, sums: Sequence[Over], numbers: Names):
         self._sums, self._names = sums, numbers
         self._discretisation: Discretisation | None = sums[0].function.discretisation if sums else None
         self._around: Any = neighbourhood_type(self._discretisation.precision) if self._discretisation else None
-        self._numbers: dict[str, Any] = {}
-        self._scenes: dict[str, Any] = {}
-        self._arrays: dict[str, Any] = {}
+        self._numbers, self._scenes, self._arrays = dict[str, Any](), dict[str, Any](), dict[str, Any]()
         self._calls, self._numbered = [], False
         for n, one in enumerate(sums):
             self._arrays |= one.read(one.function.arrays)
@@ -201,8 +179,7 @@ class _Arguments:
     def entry(self, name: str, kind: Any) -> str:
         if name == "s":
             self._around = kind
-        if name == "member":
-            self._numbered = True
+        self._numbered |= name == "member"
         if name in ("i", "s", "member"):
             return name
         if name in self._names or isinstance(kind, wp.array):
@@ -241,20 +218,14 @@ class _Arguments:
 
 
 def pointwise_kernels(
-    precision: Precision,
-    modules: Sequence[Any],
-    make: Callable[[Any], Callable[..., Any]],
-    results: Sequence[str],
-    replaced: Mapping[str, str] | None = None,
-    **names: Any,
+    precision: Precision, modules: Modules, make: Maker, results: Names, replaced: Types | None = None, **names: Any
 ) -> Kernels:
     """Make the forward, tangent and adjoint kernels of a function of one particle, in three Warp ``modules``.
 
     ``make(module)`` returns the function. ``results`` are the names of the arrays that it writes. ``replaced`` maps a
     result to an input that shares its adjoint array. The remaining ``names`` are the fields of `Kinds`.
     """
-    functions = [make(module) for module in modules]
-    terms = [Term.of(function) for function in functions]
+    terms = [Term.of(make(module)) for module in modules]
     of = _Pointwise(precision, terms[0], results, Kinds(replaced or {}, **names), modules[0].options["enable_backward"])
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())
     made = []
@@ -270,17 +241,17 @@ def pointwise_kernels(
 class Kinds:
     """Roles of parameters and results in pointwise kernels. All fields are optional."""
 
-    replaced: Mapping[str, str]
-    numbers: Collection[str] = ()
+    replaced: Types
+    numbers: Names = ()
     """Parameters that are equal for all threads and have no derivatives."""
-    written: Collection[str] = ()
+    written: Names = ()
     """Inputs with adjoints that the adjoint kernel overwrites."""
-    known: Collection[str] = ()
+    known: Names = ()
     where: str = ""
     """Name of an array that selects particles. Tangents of results are 0 where its entry is 0."""
-    told: Collection[str] = ()
+    told: Names = ()
     """Inputs with a column for each time step."""
-    summed: Collection[str] = ()
+    summed: Names = ()
     """Results that are summed over the particles of each scene."""
     turned: Mapping[str, str] = field(default_factory=dict)
     """Names of rotation matrices, with the names of their tangents, which are rotation vectors."""
@@ -289,11 +260,10 @@ class Kinds:
 
 
 class _Pointwise:
-    def __init__(self, precision: Precision, term: Term, results: Sequence[str], kinds: Kinds, taped: bool):
+    def __init__(self, precision: Precision, term: Term, results: Names, kinds: Kinds, taped: bool):
         self._term, self._precision, self._kinds, self._taped = term, precision, kinds, taped
         self._before = dict(one.split(":") for one in results if ":" in one)
-        names = (one.partition(":")[0] for one in results)
-        self._results = dict(zip(names, term.results, strict=True))
+        self._results = dict(zip((one.partition(":")[0] for one in results), term.results, strict=True))
         self._overwritten = {*kinds.replaced.values(), *kinds.written}
         self._entries, self._indices, self._inputs = {}, {}, {}
         self._numbers: dict[str, Any] = {}
@@ -317,10 +287,12 @@ class _Pointwise:
         self.scope["_no"] = wp.constant(precision.real(0.0))
         self.scope |= {f"_kind_{n}": self._change(name, kind) for n, (name, kind) in enumerate(self._results.items())}
         self.scope |= {f"_whole_{n}": kind for n, kind in enumerate(term.results)}
+        found = ", ".join(f"_found_{n}" for n in range(len(self._results)))
+        self._found = f"{found} = _function({', '.join(self._entries.values())})"
 
     def forward(self) -> tuple[str, Types, Iterable[str]]:
         writes = (f"{self._place(result)}_found_{n}" for n, result in enumerate(self._results))
-        return self._term.name, *self._kernel(self._written(""), {}, [self._found(), *writes])
+        return self._term.name, *self._kernel(self._written(""), {}, [self._found, *writes])
 
     def tangent(self) -> tuple[str, Types, Iterable[str]]:
         real, turned, changes = self._precision.real, self._kinds.turned, []
@@ -330,7 +302,7 @@ class _Pointwise:
             dot = self._changed(name, "dot", self._indices[name])
             changes.append(f"{by} * {dot}" if change is real else f"wp.{dot_of(change)}({by}, {dot})")
         changes += [f"_by_{name}" for name, text in self._kinds.read.items() if text == "_no"]
-        lines, where = [self._found()] if turned.keys() & self._results.keys() else [], self._kinds.where
+        lines, where = [self._found] if turned.keys() & self._results.keys() else [], self._kinds.where
         zeros = ["_no" if kind is real else f"_whole_{n}()" for n, kind in enumerate(self._term.results)]
         if where:
             none = (f"    {self._place(result, '_dot')}{zeros[n]}" for n, result in enumerate(self._results))
@@ -347,8 +319,7 @@ class _Pointwise:
                 own = {"n": n, "components": prod(shape), "entry": entry, "unit": unit}
                 lines.append(TANGENT.format(gradient=gradient, change=change, **own))
         lines += [f"{self._place(result, '_dot')}_total_{n}" for n, result in enumerate(self._results)]
-        written = self._written("_dot")
-        return f"{self._term.name}_tangent", *self._kernel(written, self._changes("dot"), lines)
+        return f"{self._term.name}_tangent", *self._kernel(self._written("_dot"), self._changes("dot"), lines)
 
     def adjoint(self) -> tuple[str, Types, Iterable[str]]:
         turned, held, summed, bars, left = self._kinds.turned, self._kinds.replaced, self._kinds.summed, [], {}
@@ -359,7 +330,7 @@ class _Pointwise:
             if result not in held:
                 left[bar.partition("[")[0]] = self._change(result, kind)
             bars.append(f"_leaning(_found_{n}, {bar})" if result in turned else bar)
-        lines = [self._found()] if turned.keys() & self._results.keys() else []
+        lines = [self._found] if turned.keys() & self._results.keys() else []
         lines.append(self._gradient(bars))
         for name in self._inputs:
             bar, by = self._changed(name, "bar"), f"_by_{name}"
@@ -395,10 +366,6 @@ class _Pointwise:
             else:
                 kinds[self._kinds.turned.get(name, name)] = self._change(name, kind)
         return {**told, way: bundle(**kinds)}
-
-    def _found(self) -> str:
-        found = ", ".join(f"_found_{n}" for n in range(len(self._results)))
-        return f"{found} = _function({', '.join(self._entries.values())})"
 
     def _place(self, result: str, suffix: str = "") -> str:
         before = self._before.get(result)

@@ -49,8 +49,7 @@ def sheets_type(precision: Precision) -> Any:
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions. ``scale_of`` returns the scale of a sheet. ``seen_from`` converts a position to the
-    frame of a sheet."""
+    """Make two Warp functions: ``scale_of`` a sheet, and ``seen_from``, which takes a position to a sheet's frame."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
     turnings = wp.array2d(dtype=precision.matrix)
@@ -172,6 +171,5 @@ class Sheets:
     def hide(
         self, launch: Callable[..., None], discretisation: Discretisation, search: NeighbourSearch, **known: Any
     ) -> None:
-        """Remove hidden neighbours from the lists of a search. ``known`` has the neighbourhood ``s`` and sorted
-        positions ``x``."""
+        """Remove hidden neighbours from a search, given the neighbourhood ``s`` and sorted positions ``x``."""
         launch(hiding_kernel(replace(discretisation, lanes=1)), search.lists, sheets=self.struct, **known)

@@ -69,7 +69,9 @@ def {name}(
     return _force, _torque, _pulled, _twisted, _twisted_before, _rate, _grown, _spread
 """
 
-WorkMaker = Callable[[Discretisation], Callable[..., Any]]
+Call = Callable[..., Any]
+WorkMaker = Callable[[Discretisation], Call]
+Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -100,13 +102,9 @@ class _Loop:
         )
 
     def known(self, module: Any) -> dict[str, Any]:
-        return {
-            **scope_of(self.d),
-            **{"_matrix": self.d.precision.matrix, "_pair": self.d.precision.pair},
-            "_ALL": wp.constant(ALL_WALLS),
-            "_work": wp.func(self.term.function, module=module),
-            "wp": wp,
-        }
+        types = {"_matrix": self.d.precision.matrix, "_pair": self.d.precision.pair}
+        work = wp.func(self.term.function, module=module)
+        return {**scope_of(self.d), **types, "_ALL": wp.constant(ALL_WALLS), "_work": work, "wp": wp}
 
 
 @dataclass(frozen=True)
@@ -147,10 +145,6 @@ def _kernels(of: WallTerm) -> Kernels:
         name = f"{MADE}{term.name}_act{('', '_tangent', '_adjoint')[way]}"
         return made_kernel(name, {**one, **types}, lines, loop.known(modules[way]), modules[way])
 
-    def product(name: str) -> str:
-        kind = term.parameters[name]
-        return f"_by_{name} * _change_{name}" if kind is real else f"wp.{dot_of(kind)}(_by_{name}, _change_{name})"
-
     dots = {name: f"_{name}_i_dot" for name in kinds}
     changes = {
         "x_ij": f"{dots['x']} - {MOVING['x_dot'] if d.moving else zero}",
@@ -158,8 +152,11 @@ def _kernels(of: WallTerm) -> Kernels:
         "foot": f"wp.cross({TURN if d.moving else zero}, _foot)",
         **{f"{name}_i": dots[name] for name in kinds if name != "x"},
     }
-    moved = [name for name in term.parameters if name in changes]
-    terms = [product(name) for name in moved]
+    moved = {name: kind for name, kind in term.parameters.items() if name in changes}
+    terms = [
+        f"_by_{name} * _change_{name}" if kind is real else f"wp.{dot_of(kind)}(_by_{name}, _change_{name})"
+        for name, kind in moved.items()
+    ]
     if d.moving:  # W is linear in the unit vector, of which its gradient is all that the wall does
         terms.append(f"{GROWTH} * _by_{of.bar}_i[_k]")
     along = [
@@ -175,23 +172,15 @@ def _kernels(of: WallTerm) -> Kernels:
     by = {name: next(f"_by_{p}" for p in (f"{name}_i", f"{name}_ij") if p in term.parameters) for name in kinds}
     zeros = {real: "_real(0.0)", vector: zero}
     total = wp.array(dtype=vector)
+    first = [f"{bar} = total_bar.{of.bar}[i]"]
+    first += [f"_{name}_sum = {zeros.get(kind, '_matrix()')}" for name, kind in kinds.items()]
+    back = [loop.gradients, *(f"_{name}_sum += _w_b * {one}" for name, one in by.items())]
+    stored = [f"bar.{name}[i] = bar.{name}[i] + _{name}_sum" for name in kinds]
+    act = [loop.gradients, f"_total += _w_b * _by_{of.bar}_i"]
     return Kernels(
-        made(
-            0,
-            {"total": total},
-            [f"{bar} = _vector()", "_total = _vector()"],
-            [loop.gradients, f"_total += _w_b * _by_{of.bar}_i"],
-            ["total[i] = _total"],
-        ),
+        made(0, {"total": total}, [f"{bar} = _vector()", "_total = _vector()"], act, ["total[i] = _total"]),
         made(1, {"dot": seen, "total_dot": total}, start, along, ["total_dot[i] = _total"]),
-        made(
-            2,
-            {"total_bar": bundle(**{of.bar: vector}), "bar": seen},
-            [f"{bar} = total_bar.{of.bar}[i]"]
-            + [f"_{name}_sum = {zeros.get(kind, '_matrix()')}" for name, kind in kinds.items()],
-            [loop.gradients, *(f"_{name}_sum += _w_b * {one}" for name, one in by.items())],
-            [f"bar.{name}[i] = bar.{name}[i] + _{name}_sum" for name in kinds],
-        ),
+        made(2, {"total_bar": bundle(**{of.bar: vector}), "bar": seen}, first, back, stored),
     )
 
 
@@ -207,13 +196,7 @@ class SolidShares:
         self._whole = [zeros(whole, layout.device) for _ in solids]
 
     def add(
-        self,
-        launch: Callable[..., None],
-        kernel: Callable[[], Any],
-        *groups: Named,
-        constants: tuple[float, float] = (0.0, 0.0),
-        over: int = ALL_WALLS,
-        **arrays: Any,
+        self, launch: Call, kernel: Call, *groups: Named, constants: Pair = (0.0, 0.0), over: int = ALL_WALLS, **at: Any
     ) -> None:
         """Add the contributions of a sum ``over`` one solid or all walls. ``kernel()`` makes the kernel."""
         if self._walls is None:
@@ -222,7 +205,7 @@ class SolidShares:
         known = {**self._walls.named, **own, "k": 0, "rounds": None}
         for solid in range(self._walls.solids):
             if over in (ALL_WALLS, solid):
-                launch(kernel(), self.of(solid), *groups, known, solid=solid, **arrays)
+                launch(kernel(), self.of(solid), *groups, known, solid=solid, **at)
 
     def of(self, solid: int) -> dict[str, wp.array]:
         return self._arrays[solid]

@@ -23,16 +23,11 @@ from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import sum_of
 from cortado.device.threads import field_parts, picture_parts, require, sample_parts
-from cortado.render.cameras import Camera, View, ViewTangent
+from cortado.render.cameras import View, ViewTangent
 from cortado.render.colour_field import node_functions, nodes_type, rgba_type
 from cortado.render.rays import camera_tangent_type, camera_type, interpolation_functions, ray_functions
 
 SAMPLES_PER_CELL = 2
-
-
-@cache
-def pose_type(precision: Precision) -> Any:
-    return wp.types.vector(length=6, dtype=precision.real)
 
 
 @cache
@@ -66,7 +61,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 @cache
 def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     """Return the kernels of ray marching, and the kernel of the adjoint of the colour field."""
-    real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), pose_type(precision)
+    real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), precision.six
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     change = camera_tangent_type(precision)
     start, direction, distance, *tangents, samples_within, pixels_before = ray_functions(precision)
@@ -193,35 +188,21 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     return Kernels(march, march_tangent, march_adjoint), gather
 
 
-def camera_struct(camera: Camera, step: float, precision: Precision) -> Any:
-    struct = camera_type(precision)()
-    struct.position = precision.vector(*camera.position)
-    struct.orientation = type(struct.orientation)(*camera.orientation.ravel())
-    struct.half_width, struct.growth = camera.half_width
-    struct.columns, struct.rows = camera.resolution
-    struct.near, struct.step = camera.near, step
-    struct.samples = int(np.ceil((camera.reach - camera.near) / step))
-    return struct
-
-
-def camera_tangent(along: ViewTangent, step: float, precision: Precision) -> Any:
-    struct = camera_tangent_type(precision)()
-    struct.position, struct.turn = precision.vector(*along.translation), precision.vector(*along.rotation)
-    struct.half_width, struct.growth = along.half_width
-    struct.thickness = along.extinction * step
-    return struct
-
-
 class RayMarcher:
     """Renders colour fields in one view by ray marching. Each call of ``adjoint`` overwrites the previous result."""
 
     def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
         self._step = step = nodes.cell / SAMPLES_PER_CELL
-        self._camera, self._nodes = camera_struct(view.camera, step, precision), nodes
+        seen, self._camera, self._nodes = view.camera, camera_type(precision)(), nodes
+        self._camera.position = precision.vector(*seen.position)
+        self._camera.orientation = precision.matrix(*seen.orientation.ravel())
+        self._camera.half_width, self._camera.growth = seen.half_width
+        self._camera.columns, self._camera.rows = seen.resolution
+        self._camera.near, self._camera.step = seen.near, step
+        self._camera.samples = int(np.ceil((seen.reach - seen.near) / step))
         self._thickness, self._background = view.extinction * step, precision.vector(*view.background)
         self._kernels, self._gather = absorption_kernels(precision)
         self._zeros = partial(wp.zeros, device=device)
-        self._ink, self._pose = rgba_type(precision), pose_type(precision)
         self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
         require(picture_parts(self.pixels, precision.bytes), "take a smaller resolution", device)
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
@@ -229,8 +210,8 @@ class RayMarcher:
         self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
         self._known = {"camera": self._camera, "nodes": nodes, "thickness": self._thickness}
         self._known |= {"image": self.image, "spans": self._spans}
-        self._pose_bar = self._zeros(self.pixels, dtype=self._pose)
-        self._sum = sum_of(self._pose, self.pixels, device)
+        self._pose_bar = self._zeros(self.pixels, dtype=precision.six)
+        self._sum = sum_of(precision.six, self.pixels, device)
 
     def march(self, field: wp.array) -> None:
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
@@ -238,7 +219,10 @@ class RayMarcher:
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
         """Return the tangent (pixels,) of the image along tangents of the field and of the view. The next call of
         ``tangent`` or ``adjoint`` overwrites the result."""
-        camera_dot = camera_tangent(along, self._step, self._precision)
+        vector, camera_dot = self._precision.vector, camera_tangent_type(self._precision)()
+        camera_dot.position, camera_dot.turn = vector(*along.translation), vector(*along.rotation)
+        camera_dot.half_width, camera_dot.growth = along.half_width
+        camera_dot.thickness = along.extinction * self._step
         given = {"background": self._background, "field": field, "field_dot": field_dot, "camera_dot": camera_dot}
         launch(self._kernels.tangent, self.pixels, self._device, self._known, given, image_dot=self._image_bar)
         return self._image_bar
@@ -259,8 +243,8 @@ class RayMarcher:
         parts = sample_parts(samples, self.pixels, self._precision.bytes)
         parts |= field_parts(prod(self._nodes.shape), self._precision.bytes)
         require(parts, "take a smaller resolution or a larger spacing", self._device)
-        return self._zeros((samples, self.pixels), dtype=self._ink)
+        return self._zeros((samples, self.pixels), dtype=rgba_type(self._precision))
 
     @cached_property
     def _field_bar(self) -> wp.array:
-        return self._zeros(tuple(self._nodes.shape)[::-1], dtype=self._ink)
+        return self._zeros(tuple(self._nodes.shape)[::-1], dtype=rgba_type(self._precision))

@@ -85,8 +85,7 @@ class Camera:
         raise NotImplementedError
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
-        """Return the camera after a translation (3,) [m] and a rotation about its position by a rotation vector (3,)
-        [rad].
+        """Return the camera after a translation (3,) [m] and a turn about its position, a rotation vector (3,) [rad].
 
         The renderer returns derivatives with respect to the translation and rotation at zero.
         """
@@ -156,9 +155,8 @@ def check_resolution(resolution: tuple[int, int]) -> None:
     """Raise `InputError` unless ``resolution`` is two positive whole numbers."""
     whole = isinstance(resolution, Sequence) and all(is_whole(n) and n > 0 for n in resolution)
     if not whole or len(resolution) != 2:
-        raise InputError(
-            f"resolution is {shown(resolution)}, but must be two positive whole numbers, columns and rows."
-        )
+        wanted = "two positive whole numbers, columns and rows"
+        raise InputError(f"resolution is {shown(resolution)}, but must be {wanted}.")
 
 
 WHITE = (1.0, 1.0, 1.0)
@@ -226,8 +224,7 @@ class TopView:
     def __post_init__(self) -> None:
         length = 2 if np.shape(self.lower) == (2,) else 3
         for name in ("lower", "upper"):
-            corner = vector(name, getattr(self, name), length)
-            object.__setattr__(self, name, (*corner, 0.0)[:3])
+            object.__setattr__(self, name, (*vector(name, getattr(self, name), length), 0.0)[:3])
         object.__setattr__(self, "background", vector("background", self.background))
         check_resolution(self.resolution)
         keep_own(self, "resolution")
@@ -235,21 +232,16 @@ class TopView:
         positive("opacity", self.opacity)
         if not is_whole(self.up_axis) or self.up_axis not in (0, 1, 2):
             raise InputError(f"up_axis is {shown(self.up_axis)}, but must be 0, 1 or 2.")
-        extent = np.delete(np.subtract(self.upper, self.lower), self.up_axis)
-        if not (extent > 0).all():
+        if not (np.delete(np.subtract(self.upper, self.lower), self.up_axis) > 0).all():
             raise InputError(f"upper is {shown(self.upper)}, but must be above lower, {shown(self.lower)}.")
 
     @cached_property
     def camera(self) -> Camera:
         lower, upper = np.array(self.lower), np.array(self.upper)
-        back = np.eye(3)[self.up_axis]
-        right = np.eye(3)[1 if self.up_axis == 0 else 0]
-        up = np.cross(back, right)
-        extent = upper - lower
-        columns, rows = self.resolution
+        back, right = np.eye(3)[self.up_axis], np.eye(3)[1 if self.up_axis == 0 else 0]
+        up, extent, (columns, rows) = np.cross(back, right), upper - lower, self.resolution
         width = max(extent @ right, abs(extent @ up) * columns / rows)
-        top = np.where(back, upper, 0.5 * (lower + upper))
-        margin = 8 * self.spacing
+        top, margin = np.where(back, upper, 0.5 * (lower + upper)), 8 * self.spacing
         sight = tuple(top + margin * back), tuple(top), tuple(up)
         return Orthographic(*sight, width, resolution=self.resolution, far=2 * margin + extent @ back)
 
@@ -286,8 +278,7 @@ class Calibration:
     def __post_init__(self) -> None:
         for name in self.names:
             if name not in self._values:
-                wanted = ", ".join(self._values)
-                raise InputError(f"calibrate has {shown(name)}, but must be made of {wanted}.")
+                raise InputError(f"calibrate has {shown(name)}, but must be made of {', '.join(self._values)}.")
 
     @property
     def start(self) -> dict[str, np.ndarray]:

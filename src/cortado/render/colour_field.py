@@ -234,9 +234,8 @@ def nodes_over(
     margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
-        raise InputError(
-            f"cell is {cell:g}, which makes {np.prod(counts):.1e} nodes; {MOST_NODES} at most, take a larger."
-        )
+        found = f"cell is {cell:g}, which makes {np.prod(counts):.1e} nodes"
+        raise InputError(f"{found}; {MOST_NODES} at most, take a larger.")
     flat = 3 - len(lower)
     nodes = nodes_type(precision)()
     nodes.origin = precision.vector_of(lower - margin * cell)
@@ -311,5 +310,4 @@ class ColourField:
         bars |= {"c_scene_bar": self._fractions_bar, "colours_bar": self._colours_bar}
         launch(self._field.adjoint, self._particles, self._device, self._kernel, self._known, own, bars)
         launch(self._tint.adjoint, self._particles, self._device, self._known, bars)
-        colours = self._sum(self._colours_bar).numpy()[0].astype(np.float64)
-        return self._x_bar, self._fractions_bar, colours
+        return self._x_bar, self._fractions_bar, self._sum(self._colours_bar).numpy()[0].astype(np.float64)

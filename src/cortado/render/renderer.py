@@ -89,10 +89,8 @@ class Renderer:
             raise InputError(f"upper is {shown(high.tolist())}, but must not be below lower, {shown(low.tolist())}.")
         turns = np.zeros(dimension) if periods is None else np.array(vector("periods", periods, dimension))
         if ((turns != 0.0) & (turns <= 2.0 * support)).any():
-            raise InputError(
-                f"periods is {shown(turns.tolist())}, but must be 0 or greater than two support radii, "
-                f"{2.0 * support:g} m."
-            )
+            wanted = f"0 or greater than two support radii, {2.0 * support:g} m"
+            raise InputError(f"periods is {shown(turns.tolist())}, but must be {wanted}.")
         own_colours = None if colours is None else _of_shape("colours", colours, (phases, 3)).copy()
         own: dict[str, Any] = {"lower": tuple(low), "upper": tuple(high), "smoothing": smoothing, "support": support}
         own |= {"volume": volume, "particles": particles, "phases": phases, "device": wp.get_device(device).alias}
@@ -158,7 +156,18 @@ class Renderer:
             fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; not needed for a single phase.
             colours: (phases, 3) colours of the phases; by default the renderer's colours.
         """
-        positions, fractions, colours = self._completed(positions, fractions, colours)
+        if hasattr(positions, "positions"):
+            frame, positions = positions, positions.positions
+            fractions = frame.mass_fractions if fractions is None else fractions
+            colours = getattr(frame, "colours", None) if colours is None else colours
+        if fractions is None:
+            if self._phases > 1:
+                wanted = f"mass fractions ({self._particles}, {self._phases})"
+                raise InputError(f"fractions is left out, but must be {wanted}, as there are {self._phases} phases.")
+            fractions = np.ones((self._particles, 1))
+        colours = self._colours if colours is None else colours
+        if colours is None:
+            raise InputError("colours is left out, but must be given, as the renderer was made without any.")
         x = self._on_device("positions", positions, self._dimension, self._precision.vector)
         c = self._on_device("fractions", fractions, self._phases, self._precision.fractions(self._phases))
         colours = _of_shape("colours", colours, (self._phases, 3))
@@ -202,8 +211,7 @@ class Renderer:
 
     @WARP
     def field(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coverage (nx, ny, nz) and the colour times coverage (nx, ny, nz, 3) at the nodes, for the last
-        picture."""
+        """Return the coverage (nx, ny, nz) and coverage times colour (nx, ny, nz, 3) at nodes, for the last picture."""
         found = self._field.values.numpy().astype(np.float64).transpose(2, 1, 0, 3)
         return found[..., 3].copy(), found[..., :3].copy()
 
@@ -216,20 +224,6 @@ class Renderer:
     def _require_picture(self, method: str) -> None:
         if not self._rendered:
             raise InputError(f"There is no picture to differentiate; call render before {method}.")
-
-    def _completed(self, positions: Any, fractions: Any, colours: Any) -> tuple[Any, Any, Any]:
-        if hasattr(positions, "positions"):
-            frame, positions = positions, positions.positions
-            fractions = frame.mass_fractions if fractions is None else fractions
-            colours = getattr(frame, "colours", None) if colours is None else colours
-        if fractions is None:
-            if self._phases > 1:
-                wanted = f"mass fractions ({self._particles}, {self._phases})"
-                raise InputError(f"fractions is left out, but must be {wanted}, as there are {self._phases} phases.")
-            fractions = np.ones((self._particles, 1))
-        if colours is None and self._colours is None:
-            raise InputError("colours is left out, but must be given, as the renderer was made without any.")
-        return positions, fractions, self._colours if colours is None else colours
 
     def _on_device(self, name: str, values: Any, components: int, dtype: Any) -> wp.array:
         if not isinstance(values, wp.array):
@@ -280,34 +274,21 @@ def scene_renderer(simulation: Any, extinction_factor: float = 1.0, **settings: 
     own |= {"precision": simulation.precision, "device": simulation.device, "cell": cell}
     own |= {"periods": scene.container.periods(dimension)[1]}
     own |= {"colours": np.array([phase.colour for phase in scene.phase])}
-    view = _view(_table(scene, settings), lower, upper, cut.spacing, cell, extinction_factor)
-    return Renderer(view, lower, upper, **own)
-
-
-def _table(scene: Scene, settings: dict[str, Any]) -> Render:
     given = {} if scene.render is None else scene.render.model_dump(exclude_unset=True)
-    view = settings.get("view")
-    if isinstance(view, str) and view != given.get("view"):
+    if isinstance(settings.get("view"), str) and settings["view"] != given.get("view"):
         given = {name: value for name, value in given.items() if name not in CAMERA}
-    resolved = Annotated[Render, AfterValidator(lambda table: table.in_dimension(scene.dimension))]
+    resolved = Annotated[Render, AfterValidator(lambda table: table.in_dimension(dimension))]
     with sentences(Scene):
-        return TypeAdapter(dict[str, resolved]).validate_python({"render": {**given, **settings}})["render"]
-
-
-def _view(
-    table: Render, lower: np.ndarray, upper: np.ndarray, spacing: float, cell: float, extinction_factor: float
-) -> View:
-    dimension = len(lower)
-    options: dict[str, Any] = {"background": table.background}
+        table = TypeAdapter(dict[str, resolved]).validate_python({"render": {**given, **settings}})["render"]
     resolution = (table.resolution[0], table.resolution[1])
     if table.view != "volume":
-        opacity = TopView.opacity if table.extinction is None else table.extinction * spacing
+        opacity = TopView.opacity if table.extinction is None else table.extinction * cut.spacing
         # In 2-D the one layer of nodes is a cell thick, and has to be as opaque as a layer of particles.
-        thickness = cell if dimension == 2 else spacing
-        up_axis, options["opacity"] = UP[dimension], extinction_factor * opacity
-        return TopView(tuple(lower), tuple(upper), thickness, resolution, up_axis, **options)
+        sizes: dict[str, Any] = {"spacing": cell if dimension == 2 else cut.spacing, "resolution": resolution}
+        sizes |= {"up_axis": UP[dimension], "opacity": extinction_factor * opacity, "background": table.background}
+        return Renderer(TopView(tuple(lower), tuple(upper), **sizes), lower, upper, **own)
     assert table.position is not None and table.look_at is not None and table.field_of_view is not None
     up = tuple(np.eye(3)[UP[dimension]])
     camera = Perspective(table.position, table.look_at, up, table.field_of_view, resolution=resolution)
     extinction = CLEARNESS / float(np.max(upper - lower)) if table.extinction is None else table.extinction
-    return Volume(camera, extinction_factor * extinction, **options)
+    return Renderer(Volume(camera, extinction_factor * extinction, table.background), lower, upper, **own)

@@ -169,22 +169,19 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     def average_tangent(x_ij: vector, x_dot_ij: vector, g_j: vector, g_dot_j: vector, s: neighbourhood) -> vector:
         return s.volume * (weight(x_ij, s) * g_dot_j + wp.dot(gradient(x_ij, s), x_dot_ij) * g_j)
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def average_back(x_ij, g_i, g_j, r_i, r_j, s) -> tuple[vector, vector]:
         both = wp.dot(r_i, g_j) + wp.dot(r_j, g_i)
         return (s.volume * weight(x_ij, s)) * r_j, (s.volume * both) * gradient(x_ij, s)
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def bend(x_ij, e_i, e_j, w_j, s) -> tuple[vector, vector, vector, vector]:
         g = (s.volume * w_j) * gradient(x_ij, s)
         turn = e_j - e_i
         return -wp.cw_mul(g, x_ij), -cross_terms(g, x_ij), wp.cw_mul(turn, g), even_terms(turn, g)
 
     @tangent_of(bend)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def bend_tangent(
         x_ij, x_dot_ij, e_i, e_j, e_dot_i, e_dot_j, w_j, w_dot_j, s
     ) -> tuple[vector, vector, vector, vector]:
@@ -198,8 +195,7 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
             even_terms(turn_dot, g) + even_terms(turn, g_dot),
         )
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def bend_back(x_ij, e_i, e_j, w_i, w_j, B_bar_i, B_bar_j, D_bar_i, D_bar_j, s) -> tuple[vector, real, vector]:
         g, turn = s.volume * gradient(x_ij, s), e_j - e_i
         moved = (w_j * B_bar_i + w_i * B_bar_j) * x_ij
@@ -214,14 +210,12 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
         return W * c_j, W * w_j
 
     @tangent_of(mean)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def mean_tangent(x_ij, x_dot_ij, c_j, c_dot_j, w_j, w_dot_j, s) -> tuple[real, real]:
         W, W_dot = s.volume * weight(x_ij, s), s.volume * wp.dot(gradient(x_ij, s), x_dot_ij)
         return W_dot * c_j + W * c_dot_j, W_dot * w_j + W * w_dot_j
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def mean_back(x_ij, c_i, c_j, w_i, w_j, a_i, a_j, b_i, b_j, s) -> tuple[real, real, vector]:
         W, both = s.volume * weight(x_ij, s), a_i * c_j + a_j * c_i + b_i * w_j + b_j * w_i
         return W * a_j, W * b_j, (s.volume * both) * gradient(x_ij, s)
@@ -253,28 +247,24 @@ def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleN
     own = curvature_functions(precision, dimension, module)
     normal_of, curvature_of, outermost = own.normal, own.curvature, own.outermost
 
-    @particle_kernel(module, "g z", [over(sums.colour.forward, "g z_part")])
-    @typed
+    @particle_kernel(module, "g z", [over(sums.colour.forward, "g z_part")], typed=typed)
     def colour(i: int, g, z_part, s) -> tuple[vector, real]:
         return g, z_part + real(1 - s.filling[i]) * s.self_weight * s.volume
 
-    @particle_kernel(module, "q w e", [over(sums.average.forward, "others")], numbers=["spacing"])
-    @typed
+    @particle_kernel(module, "q w e", [over(sums.average.forward, "others")], numbers=["spacing"], typed=typed)
     def normal(i: int, others, spacing, g_i, z_i, s) -> tuple[vector, real, vector]:
         q = (others + (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_i) / z_i
         w, e = normal_of(q, spacing)
         return q, w, e
 
-    @particle_kernel(module, "B D c", [over(sums.bend.forward, "diagonal others turned mixed")])
-    @typed
+    @particle_kernel(module, "B D c", [over(sums.bend.forward, "diagonal others turned mixed")], typed=typed)
     def bend(diagonal, others, turned, mixed, w_i) -> tuple[matrix, matrix, real]:
         B, D = whole(diagonal, others), even(turned, mixed)
         return B, D, w_i * curvature_of(B, D)
 
     means, constants = over(sums.mean.forward, "a_part b_part"), ["depth", "per_width"]
 
-    @particle_kernel(module, "a b acceleration:acceleration_in", [means], numbers=constants)
-    @typed
+    @particle_kernel(module, "a b acceleration:acceleration_in", [means], numbers=constants, typed=typed)
     def mean(
         i: int, a_part, b_part, depth, per_width, surface_tension, m_i, q_i, w_i, c_i, s
     ) -> tuple[real, real, vector]:
@@ -304,8 +294,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
     own = curvature_functions(precision, dimension, module)
     normal_work, curvature_of, outermost = own.normal_work, own.curvature, own.outermost
 
-    @particle_kernel(module, "q_dot w_dot e_dot", [over(sums.average.tangent, "others")], numbers=["spacing"])
-    @typed
+    @particle_kernel(module, "q_dot w_dot e_dot", [over(sums.average.tangent, "others")], ["spacing"], typed=typed)
     def normal_tangent(i: int, others, spacing, g_dot_i, z_i, z_dot_i, q_i, s) -> tuple[vector, real, vector]:
         own_part = (real(1 - s.filling[i]) * s.self_weight * s.volume) * g_dot_i
         q_dot = (others + own_part - z_dot_i * q_i) / z_i
@@ -313,8 +302,7 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
         e_dot, _spacing, _w, _e = wp.grad(normal_work)(q_i, spacing, real(0.0), q_dot)
         return q_dot, wp.dot(w_by_q, q_dot), e_dot
 
-    @particle_kernel(module, "c_dot", [over(sums.bend.tangent, "diagonal others turned mixed")])
-    @typed
+    @particle_kernel(module, "c_dot", [over(sums.bend.tangent, "diagonal others turned mixed")], typed=typed)
     def bend_tangent(diagonal, others, turned, mixed, w_i, w_dot_i, B_i, D_i) -> real:
         by_B, by_D = wp.grad(curvature_of)(B_i, D_i)
         kappa_dot = wp.ddot(by_B, even(diagonal, others)) + wp.ddot(by_D, even(turned, mixed))
@@ -322,27 +310,11 @@ def curvature_tangents(discretisation: Discretisation, dimension: int, topic: st
 
     means, constants = over(sums.mean.tangent, "a_part b_part"), ["depth", "per_width"]
 
-    @particle_kernel(module, "acceleration_dot:acceleration_in_dot", [means], numbers=constants)
-    @typed
+    @particle_kernel(module, "acceleration_dot:acceleration_in_dot", [means], numbers=constants, typed=typed)
     def mean_tangent(
-        i: int,
-        a_part,
-        b_part,
-        depth,
-        per_width,
-        surface_tension,
-        surface_tension_dot,
-        m_i,
-        m_dot_i,
-        q_i,
-        q_dot_i,
-        w_i,
-        w_dot_i,
-        c_dot_i,
-        a_i,
-        b_i,
-        s,
-    ) -> vector:
+        i: int, a_part, b_part, depth, per_width, surface_tension, surface_tension_dot, m_i, m_dot_i, q_i, q_dot_i, w_i,
+        w_dot_i, c_dot_i, a_i, b_i, s,
+    ) -> vector:  # fmt: skip
         self_weight = real(1 - s.filling[i]) * s.self_weight * s.volume
         a_dot, b_dot = a_part + self_weight * c_dot_i, b_part + self_weight * w_dot_i
         k = outermost(a_i, b_i, depth)
@@ -384,8 +356,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
 
     means = over(sums.mean.adjoint, "c_part w_part x_part", a="a_bar", b="b_bar")
 
-    @particle_kernel(module, "+x_bar +w_bar B_bar D_bar", [means])
-    @typed
+    @particle_kernel(module, "+x_bar +w_bar B_bar D_bar", [means], typed=typed)
     def mean_adjoint(
         i: int, c_part, w_part, x_part, w_i, a_bar_i, b_bar_i, B_i, D_i, s
     ) -> tuple[vector, real, matrix, matrix]:
@@ -403,8 +374,7 @@ def curvature_adjoints(discretisation: Discretisation, dimension: int, topic: st
         r = (q_bar_i + by_q) / z_i
         return x_part, r, -wp.dot(q_i, r)
 
-    @particle_kernel(module, "g_bar +x_bar", [over(sums.average.adjoint, "g_part x_part")])
-    @typed
+    @particle_kernel(module, "g_bar +x_bar", [over(sums.average.adjoint, "g_part x_part")], typed=typed)
     def normal_adjoint(i: int, g_part, x_part, r_i, s) -> tuple[vector, vector]:
         return g_part + (real(1 - s.filling[i]) * s.self_weight * s.volume) * r_i, x_part
 

@@ -160,8 +160,7 @@ class WallAction(Protocol):
     a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return the action of walls on sorted particles, (n,) vectors. For a force, these are accelerations
-        [m / s2]."""
+        """Return the action of walls on sorted particles, (n,) vectors. For a force, it is accelerations [m / s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
         """Return the tangents of the action (n,). Forward mode of the step must be complete."""

@@ -161,24 +161,9 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
     return wait, take, Kernels(park, held("x_dot v_dot"), held("x_free_bar v_free_bar"))
 
 
-def _period(periods: Points, precision: Precision) -> dict[str, Any]:
-    frequency = np.divide(1.0, periods, out=np.zeros(len(periods)), where=periods > 0.0)
-    return {"period": precision.vector_of(periods), "frequency": precision.vector_of(frequency)}
-
-
-def _mouth(one: Mouth, number: int, periods: Points, precision: Precision) -> Any:
-    found = mouth_type(precision)()
-    found.shape, found.number, found.radius = one.shape, float(number + 1), one.radius
-    found.lower, found.upper = map(precision.vector_of, one.ends)
-    for name, vector in _period(periods, precision).items():
-        setattr(found, name, vector)
-    return found
-
-
 @cache
 def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, Kernels]:
-    """Make the kernels of sinks: for counting removed particles, for missing removals, for the acceleration, and for
-    the flow rate."""
+    """Make the kernels of sinks, for counts of removed and of missing particles, the acceleration and the flow rate."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
     modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
@@ -275,10 +260,13 @@ class Drains(Part):
         self.places = to_device(of.places, precision, device)
         self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
         self._never = layout.arrays(serial=wp.float64)["serial"]
-        self._mouths = [
-            (one, _mouth(one, k, of.periods, precision), self._middle(one)) for k, one in enumerate(of.mouths)
-        ]
-        self._pulls = {name: self._pull(pull, of.periods) for name, pull in of.pulls.items()}
+        frequency = np.divide(1.0, of.periods, out=np.zeros(len(of.periods)), where=of.periods > 0.0)
+        box = {"period": precision.vector_of(of.periods), "frequency": precision.vector_of(frequency)}
+        self._mouths = [(one, *self._mouth(one, k, box)) for k, one in enumerate(of.mouths)]
+        self._pulls = {}
+        for name, pull in of.pulls.items():
+            own = {"inner": pull.shell[0], "outer": pull.shell[1], "area": pull.sphere, "holds": pull.holds}
+            self._pulls[name] = {**own, "power": float(len(of.periods)), **box}
         self._flow = {end: wp.zeros(layout.members, dtype=real, device=device) for end in ("flow", "flow_dot")}
         self._gains = {name: wp.zeros(layout.members, dtype=real, device=device) for name in of.pulls}
         counted = [behind(name).name for name in of.pulls] + [count_name(one.name) for one in of.mouths]
@@ -296,14 +284,15 @@ class Drains(Part):
     def _sum(self) -> TreeReduction:
         return self.layout.sum_of(self.layout.precision.real)
 
-    def _middle(self, one: Mouth) -> Any:
+    def _mouth(self, one: Mouth, number: int, box: Named) -> tuple[Any, Any]:
+        """Return the struct of a drain, and its middle or the name of the parameter of its middle."""
+        layout, found = self.layout, mouth_type(self.layout.precision)()
+        found.shape, found.number, found.radius = one.shape, float(number + 1), one.radius
+        found.lower, found.upper = map(layout.precision.vector_of, one.ends)
+        found.period, found.frequency = box["period"], box["frequency"]
         if one.shape == BALL:
-            return f"{one.name}.position"
-        return to_device(np.tile(one.middle, (self.layout.members, 1)), self.layout.precision, self.layout.device)
-
-    def _pull(self, pull: Pull, periods: Points) -> dict[str, Any]:
-        own = {"inner": pull.shell[0], "outer": pull.shell[1], "area": pull.sphere, "holds": pull.holds}
-        return {**own, "power": float(len(periods)), **_period(periods, self.layout.precision)}
+            return found, f"{one.name}.position"
+        return found, to_device(np.tile(one.middle, (layout.members, 1)), layout.precision, layout.device)
 
     def begin(self, step: StepContext, state: State) -> None:
         wp.copy(self.taken["taken"], state["drained"])

@@ -31,8 +31,7 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
-    """Return the Warp struct of an emitter: distances ``upstream``, ``offsets`` from the axis, ``direction`` and
-    ``area`` of the opening."""
+    """Return the Warp struct of an emitter: distances ``upstream``, ``offsets`` from the axis, and opening ``area``."""
     real, vector = precision.real, precision.vector
     particles = dict.fromkeys(("first", "count", "layer"), wp.int32)
     arrays = {"upstream": wp.array(dtype=real), "offsets": wp.array(dtype=vector)}
@@ -42,8 +41,7 @@ def nozzle_type(precision: Precision) -> Any:
 
 @cache
 def remaining_function(precision: Precision) -> Any:
-    """Make the Warp function of a particle's distance upstream of the opening [m]. It is 0 or less for free
-    particles."""
+    """Make the Warp function of a particle's distance upstream of the opening [m], at most 0 for free particles."""
     real, nozzle_of = precision.real, nozzle_type(precision)
 
     @wp.func
@@ -148,8 +146,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
         x_free_bar, v_free_bar = wp.where(free, x_bar_i, no), wp.where(free, v_bar_i, no)
         return x_free_bar, v_free_bar, wp.where(led, x_bar_i, no), wp.where(led, v_bar_i, no)
 
-    begins = Kernels(begin, begin_tangent, begin_adjoint)
-    return begins, Kernels(prescribe, prescribe_tangent, prescribe_adjoint)
+    return Kernels(begin, begin_tangent, begin_adjoint), Kernels(prescribe, prescribe_tangent, prescribe_adjoint)
 
 
 @cache

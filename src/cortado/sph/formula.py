@@ -121,13 +121,8 @@ class Numbers:
         self._places = [(one.name, sum(sizes[:k]), sizes[k]) for k, one in enumerate(parameters)]
         self.size = sum(sizes)
 
-    def pack(self, step: StepContext, values: Parameters, table: wp.array) -> None:
-        self._launch("pack", step, values, table)
-
-    def add(self, step: StepContext, table: wp.array, bar: Parameters) -> None:
-        self._launch("add", step, bar, table)
-
-    def _launch(self, kernel: str, step: StepContext, values: Parameters, table: wp.array) -> None:
+    def launch(self, kernel: str, step: StepContext, values: Parameters, table: wp.array) -> None:
+        """``pack`` the values of a step in the table, or ``add`` the adjoint of the table to the values."""
         for name, first, size in self._places:
             count = values[name].size * getattr(values[name].dtype, "_length_", 1)
             numbers = components(values[name], (self._members, count // self._members))
@@ -142,7 +137,7 @@ class OwnParameters:
         self._layout, own = layout, [one for one in parameters if one.axis is not Axis.ARRAY]
         self._numbers = Numbers(own, layout, taped)
         self._arrays = Numbers([one for one in parameters if one.axis is Axis.ARRAY], layout, taped)
-        self._size, members = self._arrays.size, layout.members
+        self._size, members, self._real = self._arrays.size, layout.members, layout.precision.real
         dtype = theta_of(layout.precision, [one.rank for one in own])
         options: dict[str, Any] = {"dtype": dtype, "device": layout.device}
         self._theta, self._theta_dot = wp.zeros(members, **options, requires_grad=taped), wp.zeros(members, **options)
@@ -151,20 +146,18 @@ class OwnParameters:
         self._sum_theta = layout.sum_of(dtype) if own else None
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (members * max(self._size, 1))), 1)
+        self.threads = members * self.rows if self._size else None
+        """Number of threads of the adjoint; None for one thread per particle."""
         self._table = self._new(values=self._zeros(members, self._size, requires_grad=taped))
-
-    @property
-    def threads(self) -> int | None:
-        """Return the number of threads of the adjoint; None for one thread per particle."""
-        return self._layout.members * self.rows if self._size else None
 
     def now(self, step: StepContext) -> dict[str, Any]:
         return self._told(step, "_table")
 
     def along(self, step: StepContext, parameters_dot: Parameters) -> dict[str, Any]:
         if self._size:
-            self._arrays.pack(step, parameters_dot, self._along.dots)
-        return {**self._told(step, "_along"), "theta_dot": self._packed(step, parameters_dot, self._theta_dot)}
+            self._arrays.launch("pack", step, parameters_dot, self._along.dots)
+        self._numbers.launch("pack", step, parameters_dot, _flat(self._theta_dot))
+        return {**self._told(step, "_along"), "theta_dot": self._theta_dot}
 
     def back(self, step: StepContext) -> dict[str, Any]:
         return {**self._told(step, "_back"), "theta_bar": self._theta_bar, "rows": self.rows}
@@ -172,25 +165,19 @@ class OwnParameters:
     def collect(self, step: StepContext, bar: Adjoints) -> None:
         """Add the terms of particles to the adjoints of the parameters."""
         if self._sum_theta is not None:
-            self._numbers.add(step, self._flat(self._sum_theta(self._theta_bar)), bar.parameters)
+            self._numbers.launch("add", step, bar.parameters, _flat(self._sum_theta(self._theta_bar)))
         if self._size:
             total = self._sum(self._back.rows.flatten()).reshape((self._size, self._layout.members))
-            self._arrays.add(step, total.transpose((1, 0)), bar.parameters)
+            self._arrays.launch("add", step, bar.parameters, total.transpose((1, 0)))
             self._back.rows.zero_()
 
     def _told(self, step: StepContext, name: str) -> dict[str, Any]:
-        found = {"theta": self._packed(step, step.parameters, self._theta)}
+        self._numbers.launch("pack", step, step.parameters, _flat(self._theta))
+        found = {"theta": self._theta}
         if self._size:
             found["table"] = getattr(self, name)
-            self._arrays.pack(step, step.parameters, found["table"].values)
+            self._arrays.launch("pack", step, step.parameters, found["table"].values)
         return found
-
-    def _packed(self, step: StepContext, values: Parameters, theta: wp.array) -> wp.array:
-        self._numbers.pack(step, values, self._flat(theta))
-        return theta
-
-    def _flat(self, theta: wp.array) -> wp.array:
-        return components(theta, (len(theta), theta.dtype._length_))
 
     @cached_property
     def _along(self) -> Any:
@@ -202,18 +189,20 @@ class OwnParameters:
 
     @cached_property
     def _sum(self) -> Any:
-        layout = self._layout
-        return sum_of(layout.precision.real, self.rows, layout.device, self._size * layout.members)
+        return sum_of(self._real, self.rows, self._layout.device, self._size * self._layout.members)
 
     def _new(self, **arrays: wp.array) -> Any:
-        made, none = table_type(self._layout.precision)(), self._zeros(0, 0)
+        made = table_type(self._layout.precision)()
         for name in ("values", "dots", "rows"):
-            setattr(made, name, arrays.get(name, none))
+            setattr(made, name, arrays[name] if name in arrays else self._zeros(0, 0))
         return made
 
     def _zeros(self, *shape: int, requires_grad: bool = False) -> wp.array:
-        options = {"device": self._layout.device, "requires_grad": requires_grad}
-        return wp.zeros(shape, dtype=self._layout.precision.real, **options)
+        return wp.zeros(shape, dtype=self._real, device=self._layout.device, requires_grad=requires_grad)
+
+
+def _flat(theta: wp.array) -> wp.array:
+    return components(theta, (len(theta), theta.dtype._length_))
 
 
 @dataclass(frozen=True)
@@ -251,6 +240,10 @@ class Formula:
     """Text with all outside values and Warp functions that the function uses."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     phases: int = 0
+    ranks: tuple[int, ...] = ()
+    """Numbers of axes of the parameters: 0 for a number and 1 for a vector."""
+    topic: str = ""
+    """For a law of viscosity: part of the names of its Warp modules, empty for Newtonian fluids."""
 
     def of_phases(self, what: str, phases: int) -> "Formula":
         """Return the formula for this number of phases. Raise `InputError` if the function needs a different number."""
@@ -271,19 +264,15 @@ class Formula:
         if self.arrays:
             functions = reading(precision, module.options["enable_backward"])
             scope |= {PLACE: functions.place, READ: functions.read}
-        code = compile(self.text, f"<force {self.name}>", "exec")
-        exec(code, scope)
+        exec(compile(self.text, f"<force {self.name}>", "exec"), scope)
         made: Any = scope[self.name]
         own = vector if self.kind == "vector" else real
         made.__annotations__ = dict(zip(self.inputs, (own, own, real), strict=False)) | self.takes(precision)
         made.__annotations__ |= dict(zip(self.parameters, types, strict=True)) | self.reads(precision) | {"return": own}
         return wp.Function(func=made, key=self.name, namespace="", module=module, source=self.text)
 
-    def fractions(self, precision: Precision) -> Any:
-        return precision.fractions(max(self.phases, 1))
-
     def takes(self, precision: Precision) -> dict[str, Any]:
-        kinds = {"velocity_gradient": precision.matrix, FRACTIONS: self.fractions(precision)}
+        kinds = {"velocity_gradient": precision.matrix, FRACTIONS: precision.fractions(max(self.phases, 1))}
         return {name: kinds.get(name, precision.real) for name in self.fields}
 
     def reads(self, precision: Precision) -> dict[str, Any]:
@@ -356,10 +345,9 @@ def _arguments(
         raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
     if len(inputs) not in (2, 3) or tuple(signature)[: len(taken)] != taken or taken[: len(inputs)] != inputs:
         of_particles = f", {', '.join(first.fields)} or none of them" if first.fields else ""
-        wanted = (
-            f"two {first.kind}s first, then time or nothing{of_particles}, and then parameters that all have values"
-        )
-        raise InputError(f"{what} has {', '.join(taken) or 'nothing'} without a value, but must have {wanted}.")
+        wanted = f"two {first.kind}s first, then time or nothing{of_particles}, and then parameters"
+        found = f"{what} has {', '.join(taken) or 'nothing'} without a value"
+        raise InputError(f"{found}, but must have {wanted} that all have values.")
     return taken, values
 
 
@@ -372,31 +360,28 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
         except Exception as error:  # Warp raises any kind for a text that it does not understand
             said.seek(0)
             found = re.findall("error: (.*)", said.read().decode(errors="replace"))
-            text = (
-                TYPES.sub(lambda one: "a vector" if "vec" in one[0] else "a number", found[0]) if found else str(error)
-            )
+            text = TYPES.sub(lambda t: "a vector" if "vec" in t[0] else "a number", found[0]) if found else str(error)
             reason = text.replace("\\n", "\n").strip().splitlines()[-1:] or [type(error).__name__]
-            wanted = (
-                f"it must use numbers, vectors of three components and functions of Warp alone, and return a {returned}"
-            )
-            raise InputError(f"{what} cannot be compiled: {reason[0].lstrip('; ').rstrip('.')}; {wanted}.") from error
+            wanted = f"numbers, vectors of three components and functions of Warp alone, and return a {returned}"
+            first = reason[0].lstrip("; ").rstrip(".")
+            raise InputError(f"{what} cannot be compiled: {first}; it must use {wanted}.") from error
         said.seek(0)
         sys.stderr.write(said.read().decode(errors="replace"))
 
 
-def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimension: int, module: Any) -> Any:
+def applied(text: Formula, precision: Precision, dimension: int, module: Any) -> Any:
     """Make the Warp function that calls a user-defined function.
 
     Its arguments are two vectors or numbers, the parameter vector, and the arguments of `Formula.takes` and
     `Formula.reads`. In 2-D the z component of the result is 0.
     """
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
-    types = tuple(precision.vector if rank else precision.real for rank in ranks[timed:])
+    types = tuple(precision.vector if rank else precision.real for rank in text.ranks[timed:])
     terms, first = [], 0
-    for rank in ranks:
-        at = ", ".join(f"theta[{first + k}]" for k in range(3 if rank else 1))
+    for rank in text.ranks:
+        at = ", ".join(f"theta[{first + k}]" for k in range(WIDTH[rank]))
         terms.append(f"vector({at})" if rank else at)
-        first += 3 if rank else 1
+        first += WIDTH[rank]
     more, places = text.takes(precision) | text.reads(precision), [*terms[:timed], *text.fields, *terms[timed:]]
     called = f"own({', '.join(['x', 'v', *places, *text.reads(precision)])})"
     result = called if dimension == 3 or of_numbers else f"wp.cw_mul(vector(one, one, zero), {called})"
@@ -407,5 +392,5 @@ def applied(text: Formula, precision: Precision, ranks: tuple[int, ...], dimensi
     scope = {"vector": precision.vector, "one": one, "zero": zero, "wp": wp, "own": own}
     exec(source, scope)
     made: Any = scope["applied"]
-    made.__annotations__ = {"x": own_type, "v": own_type, "theta": theta_of(precision, ranks), **more}
+    made.__annotations__ = {"x": own_type, "v": own_type, "theta": theta_of(precision, text.ranks), **more}
     return wp.Function(func=made, key="applied", namespace="", module=module, source=source)

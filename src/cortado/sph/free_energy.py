@@ -52,8 +52,7 @@ FLOOR = 1e-3
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define free
-    energies."""
+    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define more."""
 
     name: str
     value: Callable[[np.ndarray], np.ndarray]

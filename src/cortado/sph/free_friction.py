@@ -25,7 +25,7 @@ from cortado.device.reduction import add
 from cortado.particles.mirrors import ALL_WALLS
 from cortado.particles.state import Layout, zeros
 from cortado.scene.motions import free
-from cortado.sph.free_solids import Changes, FreeBody
+from cortado.sph.free_solids import Changes, FreeBody, Motions
 from cortado.sph.friction_kernels import friction_kernels, lift_kernels, row_kernels
 from cortado.sph.moving_solids import move_kernels
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
@@ -34,7 +34,7 @@ Arrays = dict[str, wp.array]
 VELOCITIES = ("V", "L", "W", "faster", "turned_faster")
 
 
-def begun(body: FreeBody | Changes) -> Arrays:
+def begun(body: Motions) -> Arrays:
     return {f"{name[0]}_0{name[1:]}": array for name, array in body.before.items()}
 
 
@@ -55,11 +55,11 @@ class BodyFriction:
         self.none_total = wp.zeros(members, dtype=real, device=layout.device)
         self.impulse = {"impulse": wp.zeros(members, dtype=six, device=layout.device)}
 
-    def momenta(self, body: FreeBody | Changes) -> Iterator[tuple[wp.array, wp.array, wp.array]]:
+    def momenta(self, body: Motions) -> Iterator[tuple[wp.array, wp.array, wp.array]]:
         """Yield the momenta of the body, with the momenta by contacts and by the pressures of the previous step."""
         return zip((self.arrays[one] for one in self._momenta), body.given.values(), body.pressed.values(), strict=True)
 
-    def add_up(self, body: FreeBody | Changes) -> None:
+    def add_up(self, body: Motions) -> None:
         for total, given, pressed in self.momenta(body):
             wp.copy(total, given)
             add(pressed, total)
@@ -98,10 +98,8 @@ class FreeFriction:
         if names:
             self.kernels = friction_kernels(setting.discretisation, scene.dimension)
             self.move, self.lifts = move_kernels(layout.precision), lift_kernels(layout.precision)
-        vector = layout.precision.vector
-        self.lift = {"lift": wp.zeros(layout.members, dtype=vector, device=layout.device)}
+        self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
         """Negative velocity change by gravity in a step."""
-
         self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
 
     def each(self, step: StepContext) -> Iterator[tuple[FreeBody, BodyFriction, BodyRows]]:
@@ -134,22 +132,19 @@ class FreeFriction:
     def launch(self, step: StepContext, kernel: Any, body: FreeBody, *groups: Named) -> None:
         step.launch(kernel, *groups, begun(body), *body.known(step), threads=self.layout.members)
 
-    def pull(self, step: StepContext, *known: Named, v: wp.array) -> None:
-        """Add the terms of rigid bodies to the velocity sums and stresses of particles with velocities ``v``."""
-        for _, own, _ in self.each(step):
-            step.launch(self.kernels.pull, own.arrays, self.constants, *known, v=v)
+    def pull(self, step: StepContext, *known: Named, v: wp.array, solves: bool = False) -> None:
+        """Add the terms of rigid bodies to the velocity sums and stresses of particles with velocities ``v``. In a
+        solve the bodies have the velocities of its vector."""
+        for _, own, rows in self.each(step):
+            step.launch(self.kernels.pull, rows.velocities if solves else {}, own.arrays, self.constants, *known, v=v)
 
     def push(self, step: StepContext, *known: Named, v: wp.array, acceleration: wp.array) -> None:
         """Add the friction of rigid bodies to the accelerations of particles with velocities ``v``."""
         for _, own, rows in self.each(step):
-            self.rub(step, own, *known, v=v)
+            step.launch(self.kernels.rub.forward, own.arrays, self.constants, *known, v=v)
             add(own.arrays["rub"], acceleration)
             step.launch(self.kernels.bear.forward, own.arrays)
             wp.copy(rows.arrays["r"], own.whole())
-
-    def rub(self, step: StepContext, own: BodyFriction, *known: Named, v: wp.array) -> None:
-        """Write the accelerations and couples of particles by the friction of one rigid body."""
-        step.launch(self.kernels.rub.forward, own.arrays, self.constants, *known, v=v)
 
     def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
         """Add the terms of rigid bodies to the product of the solve's matrix and the vector ``p``."""
@@ -157,24 +152,17 @@ class FreeFriction:
             step.launch(self.kernels.push, rows.velocities, own.arrays, self.constants, found, *known, v=p)
             rows.load = own.whole()
 
-    def lean(self, step: StepContext, known: tuple[Named, ...], p: wp.array) -> None:
-        """Add the terms of rigid bodies to the velocity sums and stresses of the vector ``p``."""
-        for _, own, rows in self.each(step):
-            step.launch(self.kernels.pull, rows.velocities, own.arrays, self.constants, *known, v=p)
-
     def finish(self, step: StepContext) -> None:
-        """Add the impulses of the solve to the momenta of rigid bodies, and write the velocities at the end of the
-        step."""
+        """Add the impulses of the solve to the momenta of bodies, and write their velocities after the step."""
         for body, own, rows in self.each(step):
             rows.launch(step, rows.kernels.give, body.given, own.impulse)
         self.start(step)
 
     def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
-        """Add the action of rigid bodies on particles to ``total``, the action of a solid or of all solids. ``name`` is
-        "rub" or "couple"."""
+        """Add the action of rigid bodies to ``total``, that of one or all solids. ``name`` is "rub" or "couple"."""
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
-                self.rub(step, own, now, v=now["v"])
+                step.launch(self.kernels.rub.forward, own.arrays, self.constants, now)
                 add(own.arrays[name], total)
 
 
@@ -227,8 +215,7 @@ class FrictionTangent(FrictionChanges):
         for change, dots, own, _ in self._each(step, dot):
             dots.add_up(change)
             rates = {"density_dot": dot.parameters[change.body.table.weight]}
-            known = dots.arrays, begun(change), rates, *dot.named, own.arrays
-            of.launch(step, of.move.tangent, change.body, *known)
+            of.launch(step, of.move.tangent, change.body, dots.arrays, begun(change), rates, *dot.named, own.arrays)
 
     def lean(self, step: StepContext, dot: Tangents, A_dot: wp.array, *known: Named) -> None:
         for _, dots, own, _ in self._each(step, dot):
@@ -331,8 +318,7 @@ class FrictionAdjoint(FrictionChanges):
             self._shared(step, kernels.lean.adjoint, change.before, change.body.before, *groups)
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
-        """Apply the adjoints of the bodies' final velocities. ``u_bar`` is the adjoint of the particles' final
-        velocities."""
+        """Apply the adjoints of the bodies' final velocities. ``u_bar`` is that of the particles' final velocities."""
         of = self._friction
         if of.rows:
             share, sizes = self._shares["V_bar"], {"time_step_bar": bar.parameters["time_step"]}

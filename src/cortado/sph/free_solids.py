@@ -26,7 +26,7 @@ from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.particles.state import Entry, Layout, State, StateField
+from cortado.particles.state import Entry, Layout, Parameters, State, StateField
 from cortado.scene.links import Hold, Joint, inertia_about
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
@@ -81,20 +81,9 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
     @typed
     def predict(
-        time_step_i,
-        position_i,
-        turn_x_i,
-        turn_y_i,
-        turn_z_i,
-        rotation_i,
-        velocity_i,
-        angular_velocity_i,
-        density_i,
-        gravity_i,
-        volume,
-        inertia,
-        hold,
-    ) -> tuple[vector, matrix, vector, matrix, vector, vector, vector]:
+        time_step_i, position_i, turn_x_i, turn_y_i, turn_z_i, rotation_i, velocity_i, angular_velocity_i, density_i,
+        gravity_i, volume, inertia, hold,
+    ) -> tuple[vector, matrix, vector, matrix, vector, vector, vector]:  # fmt: skip
         R = (wp.identity(n=3, dtype=real) + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)) * begun_rotation(
             rotation_i
         )
@@ -106,21 +95,9 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
 
     @typed
     def end(
-        time_step_i,
-        position_i,
-        turn_x_i,
-        turn_y_i,
-        turn_z_i,
-        rotation_i,
-        turns_before_i,
-        V_i,
-        W_i,
-        L_i,
-        density_i,
-        inertia,
-        inverse,
-        hold,
-    ) -> tuple[vector, vector, vector, vector, angle, vector, angle]:
+        time_step_i, position_i, turn_x_i, turn_y_i, turn_z_i, rotation_i, turns_before_i, V_i, W_i, L_i, density_i,
+        inertia, inverse, hold,
+    ) -> tuple[vector, vector, vector, vector, angle, vector, angle]:  # fmt: skip
         turning = rotation(time_step_i * W_i)
         Q = evened(turning * (wp.identity(n=3, dtype=real) + wp.matrix_from_cols(turn_x_i, turn_y_i, turn_z_i)))
         R = turning * turns_before_i
@@ -138,12 +115,8 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     return begins, pointwise_kernels(precision, modules, lambda _: end, new, replaced, turned=turned, **at_end)
 
 
-NAMES = {
-    "position": position_name,
-    "rotation": rotation_name,
-    "velocity": velocity_name,
-    "angular_velocity": angular_velocity_name,
-}
+NAMES = {"position": position_name, "rotation": rotation_name}
+NAMES |= {"velocity": velocity_name, "angular_velocity": angular_velocity_name}
 
 
 @dataclass(frozen=True)
@@ -159,8 +132,7 @@ class FreeTable:
 
     @property
     def inertia(self) -> np.ndarray:
-        """Return the inertia (3, 3) about the body's hinge. Without a hinge, return the inertia about the centre of
-        mass."""
+        """Return the inertia (3, 3) about the body's hinge, or without a hinge about the centre of mass."""
         return inertia_about(self.hold, self.mass)
 
     @property
@@ -210,19 +182,30 @@ def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dic
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
 
-class FreeBody:
+class Motions:
+    """Arrays (members,) by names of kernel arguments: velocities before and after the solve for pressures, and momenta
+    that a body gets. ``suffix`` selects tangents or adjoints."""
+
+    def __init__(self, layout: Layout, suffix: str = ""):
+        vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
+        self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
+        self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
+        """Momentum and angular momentum by contacts, springs and friction, and for no-slip bodies by the pressures of
+        the previous step."""
+
+
+class FreeBody(Motions):
     def __init__(self, table: FreeTable, poses: Named, dimension: int, layout: Layout):
-        self.table, vector = table, layout.precision.vector
+        super().__init__(layout)
+        self.table = table
         angle = Entry.NUMBER if dimension == 2 else Entry.VECTOR
-        angles = {"rotation": angle, "angular_velocity": angle}
-        units = {"position": "m", "rotation": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
+        kinds = {"position": ("m", Entry.VECTOR), "rotation": ("rad", angle)}
+        kinds |= {"velocity": ("m/s", Entry.VECTOR), "angular_velocity": ("rad/s", angle)}
         self.names = {label: name(table.name) for label, name in NAMES.items()}
         self.names |= {label: f"{table.name}.{label}" for label in AXES}
         """Names of the body's state fields, by names of kernel arguments."""
-        begun = (
-            StateField(self.names[label], unit, angles.get(label, Entry.VECTOR), Axis.SCALAR, self.names[label])
-            for label, unit in units.items()
-        )
+        named = ((self.names[label], *kind) for label, kind in kinds.items())
+        begun = (StateField(name, unit, entry, Axis.SCALAR, name) for name, unit, entry in named)
         self.fields = (*begun, *(StateField(self.names[label], "", Entry.VECTOR, Axis.SCALAR) for label in AXES))
         self.begun = layout.state(self.fields)
         matrix = layout.precision.matrix
@@ -231,13 +214,6 @@ class FreeBody:
         self.constants |= {"inverse": matrix(*inverse.ravel()), "volume": table.mass.volume}
         self.constants |= {"solid": table.number, "hold": hold_numbers(table.hold, layout.precision)}
         self.constants |= table.bounds
-        self.given = {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in GIVEN}
-        """Momentum and angular momentum by contacts, springs and friction."""
-        self.pressed = {name: wp.zeros_like(array) for name, array in self.given.items()}
-        """Momentum and angular momentum by the pressures of the previous step, for no-slip bodies."""
-        self.before, self.moved = (
-            {name: wp.zeros(layout.members, dtype=vector, device=layout.device) for name in MOTION} for _ in range(2)
-        )
 
     def state(self, state: State, suffix: str = "") -> dict[str, wp.array]:
         return {f"{label}{suffix}": state[name] for label, name in self.names.items()}
@@ -247,14 +223,20 @@ class FreeBody:
         return self.constants, self.state(self.begun), {"density": density}
 
 
-class Changes:
+class Changes(Motions):
+    """Tangents or adjoints of a body."""
+
     def __init__(self, body: FreeBody, layout: Layout, suffix: str):
-        vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
-        self.body = body
-        self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
-        self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
-        self.turned_end = wp.zeros(**vectors)
+        super().__init__(layout, suffix)
+        self.body, self._suffix = body, suffix
+        self.turned_end = wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)
         """Adjoint of a small rotation of the body, from the end of the step."""
+
+    def known(self, of: Parameters, state: State) -> dict[str, wp.array]:
+        """Return the changes of the parameters and of the body's state, by names of kernel arguments."""
+        names = {"time_step": "time_step", "gravity": "gravity", "density": self.body.table.weight}
+        sizes = {f"{label}{self._suffix}": of[name] for label, name in names.items()}
+        return {**self.body.state(state, self._suffix), **self.body.state(state, f"_new{self._suffix}"), **sizes}
 
     def clear(self) -> None:
         groups = self.before, self.moved, self.given, self.pressed
@@ -269,7 +251,9 @@ class FreeSolidsTangent(PartTangent):
         self._pushes = [push.tangent(self.bodies) for push in part.pushes]
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self.part.begins.tangent, step, dot, state_dot, begins=True)
+        for own in self.bodies:
+            known = own.known(dot.parameters, state_dot), own.before, *own.body.known(step)
+            step.launch(self.part.begins.tangent, *known, threads=self.part.layout.members)
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         for own in self.bodies:
@@ -279,17 +263,9 @@ class FreeSolidsTangent(PartTangent):
             push.look(step, dot)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        self._launch(self.part.ends.tangent, step, dot, state_dot, begins=False)
-
-    def _launch(self, kernel: Any, step: StepContext, dot: Tangents, state_dot: State, begins: bool) -> None:
-        part = self.part
         for own in self.bodies:
-            body = own.body
-            sizes = {f"{name}_dot": dot.parameters[name] for name in ("time_step", "gravity")}
-            sizes["density_dot"] = dot.parameters[body.table.weight]
-            dots = {**body.state(state_dot, "_dot"), **body.state(state_dot, "_new_dot"), **sizes}
-            moves = (own.before,) if begins else (own.moved, body.moved)
-            step.launch(kernel, dots, *moves, *body.known(step), threads=part.layout.members)
+            known = own.known(dot.parameters, state_dot), own.moved, own.body.moved, *own.body.known(step)
+            step.launch(self.part.ends.tangent, *known, threads=self.part.layout.members)
 
 
 class FreeSolidsAdjoint(PartAdjoint):
@@ -299,11 +275,10 @@ class FreeSolidsAdjoint(PartAdjoint):
         self._pushes = [push.adjoint(self.bodies) for push in reversed(part.pushes)]
 
     def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
-        part = self.part
         for own in self.bodies:
-            bars, body = {**self._bars(own, bar, state_bar), "turned_before_bar": own.turned_end}, own.body
-            known = (own.moved, body.moved, *body.known(step))
-            step.launch(part.ends.adjoint, bars, *known, threads=part.layout.members)
+            known = own.known(bar, state_bar), own.moved, own.body.moved, *own.body.known(step)
+            end = {"turned_before_bar": own.turned_end}
+            step.launch(self.part.ends.adjoint, end, *known, threads=self.part.layout.members)
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
@@ -311,18 +286,12 @@ class FreeSolidsAdjoint(PartAdjoint):
             push.look(step, bar)
 
     def begin(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        part = self.part
         for own in self.bodies:
-            body, bars = own.body, {**self._bars(own, bar.parameters, state_bar), **own.before}
-            given = bar.solids.collect(body.table.number)
+            given = bar.solids.collect(own.body.table.number)
             add(own.turned_end, given["turned_before_bar"])
-            step.launch(part.begins.adjoint, bars, given, *body.known(step), threads=part.layout.members)
+            known = own.known(bar.parameters, state_bar), own.before, given, *own.body.known(step)
+            step.launch(self.part.begins.adjoint, *known, threads=self.part.layout.members)
             own.clear()
-
-    def _bars(self, own: Changes, bar: Any, state_bar: State) -> dict[str, wp.array]:
-        sizes = {f"{name}_bar": bar[name] for name in ("time_step", "gravity")}
-        sizes["density_bar"] = bar[own.body.table.weight]
-        return {**own.body.state(state_bar, "_bar"), **own.body.state(state_bar, "_new_bar"), **sizes}
 
 
 class FreeSolidsPart(Part):

@@ -18,7 +18,7 @@ import warp as wp
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError
-from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, check_returns, counts_of
+from cortado.sph.function_text import DerivativeCheck, Frozen, check_names, returns
 
 REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "cortado_nearest", "cortado_whole"
 """Names of the Warp functions for a % b, a // b, round(a) and int(a)."""
@@ -26,8 +26,7 @@ REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "
 
 @cache
 def meanings(precision: Precision) -> dict[str, Any]:
-    """Make Warp functions of Python's operators, by name. Results of a % b and a // b are equal to CPython's bit for
-    bit."""
+    """Make Warp functions of Python's operators, by name. a % b and a // b are equal to CPython's bit for bit."""
     real, module = precision.real, kernel_module(f"python_{precision.name}")
     none, one, half = (wp.constant(real(value)) for value in (0.0, 1.0, 0.5))
 
@@ -91,19 +90,18 @@ class InPrecision(ast.NodeTransformer):
     def visit_Name(self, node: ast.Name) -> ast.AST:
         if node.id in self._arrays:
             found = f"{self._what} has the array {node.id} without indices, or gives it another value"
-            raise InputError(
-                f"{found}, but must read its numbers, as in {node.id}[0], or its sizes by {node.id}.shape."
-            )
+            wanted = f"read its numbers, as in {node.id}[0], or its sizes by {node.id}.shape"
+            raise InputError(f"{found}, but must {wanted}.")
         return self._resolved(node) if isinstance(node.ctx, ast.Load) else node
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         return self.generic_visit(node) if (found := self._resolved(node)) is node else found
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
-        if isinstance(node.value, ast.Name) and node.value.id in self._arrays:
-            return self._read(node, *self._arrays[node.value.id])
-        node.value = self.visit(node.value)
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if isinstance(node.value, ast.Name) and node.value.id in self._arrays:
+            return self._read(node, parts, *self._arrays[node.value.id])
+        node.value = self.visit(node.value)
         numbers = [self._index(part) for part in parts]
         if isinstance(node.value, ast.Name) and node.value.id in self._given and set(numbers) - set(range(-3, 3)):
             raise InputError(f"{self._what} has {ast.unparse(node)}, but must have an index of 0, 1 or 2 there.")
@@ -111,40 +109,35 @@ class InPrecision(ast.NodeTransformer):
         node.slice = ast.Tuple(written, ast.Load()) if isinstance(node.slice, ast.Tuple) else written[0]
         return node
 
-    def _read(self, node: ast.Subscript, first: int, shape: tuple[int, ...]) -> ast.AST:
-        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+    def _read(self, node: ast.Subscript, parts: list[ast.expr], first: int, shape: tuple[int, ...]) -> ast.AST:
         if len(parts) != len(shape) or any(isinstance(part, (ast.Slice, ast.Starred)) for part in parts):
             found = f"{self._what} has {ast.unparse(node)}"
             raise InputError(f"{found}, but must have an index for each axis of its shape {shape}.")
-        place: ast.expr = _number(node, first)  # type: ignore[assignment]
+        place = _number(node, first)
         for k, (part, size) in enumerate(zip(parts, shape, strict=True)):
-            own = self._place(node, part, size)
-            place = ast.BinOp(place, ast.Add(), ast.BinOp(own, ast.Mult(), _number(node, prod(shape[k + 1 :]))))  # type: ignore[arg-type]
-        return ast.Call(ast.Name(READ, ast.Load()), [*(ast.Name(name, ast.Load()) for name in READ_OF), place], [])
+            own = ast.BinOp(self._place(node, part, size), ast.Mult(), _number(node, prod(shape[k + 1 :])))
+            place = ast.BinOp(place, ast.Add(), own)
+        return _call(READ, *(ast.Name(name, ast.Load()) for name in READ_OF), place)
 
     def _place(self, node: ast.Subscript, part: ast.expr, size: int) -> ast.expr:
         number = self._whole(part)
         if number is None:
-            given = ast.Call(ast.Name(REAL, ast.Load()), [self.visit(part)], [])
-            return ast.Call(ast.Name(PLACE, ast.Load()), [given, _number(node, size)], [])  # type: ignore[list-item]
+            return _call(PLACE, _call(REAL, self.visit(part)), _number(node, size))
         if not -size <= number < size:
             found = f"{self._what} has {ast.unparse(node)}, which has the index {number}"
             raise InputError(f"{found}, but must have one from {-size} to {size - 1} there.")
-        return _number(node, number % size)  # type: ignore[return-value]
+        return _number(node, number % size)
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST:
         return node if isinstance(node.value, ast.Constant) else self.generic_visit(node)
 
     def visit_For(self, node: ast.For) -> Lines:
-        ends, lines = [self._index(end) for end in node.iter.args], list[ast.stmt]()
+        ends, found = [self._index(end) for end in node.iter.args], list[ast.AST | list[ast.stmt]]()
         for count in range(*ends):
             self._counts[node.target.id] = count
-            lines += self._lines(node.body)
-        return lines + self._lines(node.orelse) or [ast.Pass()]
-
-    def _lines(self, lines: list[ast.stmt]) -> list[ast.stmt]:
-        found = [self.visit(deepcopy(line)) for line in lines]
-        return [line for one in found for line in (one if isinstance(one, list) else [one])]
+            found += [self.visit(deepcopy(line)) for line in node.body]
+        found += [self.visit(deepcopy(line)) for line in node.orelse]
+        return [line for one in found for line in (one if isinstance(one, list) else [one])] or [ast.Pass()]
 
     def visit_AugAssign(self, node: ast.AugAssign) -> Lines:
         before = ast.Name(node.target.id, ast.Load())  # type: ignore[union-attr]
@@ -152,28 +145,25 @@ class InPrecision(ast.NodeTransformer):
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
         left, right = self.visit(node.left), self.visit(node.right)
-        if (name := _OPERATORS.get(type(node.op))) is not None:
-            return ast.Call(ast.Name(name, ast.Load()), [left, right], [])
-        return ast.BinOp(left, node.op, right)
+        name = _OPERATORS.get(type(node.op))
+        return _call(name, left, right) if name else ast.BinOp(left, node.op, right)
 
     def visit_Compare(self, node: ast.Compare) -> ast.AST:
-        values = [node.left, *node.comparators]
-        pairs = zip(values, node.ops, values[1:], strict=False)
-        each: list[ast.expr] = [
-            ast.Compare(self.visit(deepcopy(a)), [op], [self.visit(deepcopy(b))]) for a, op, b in pairs
-        ]
+        values, each = [node.left, *node.comparators], list[ast.expr]()
+        for a, op, b in zip(values, node.ops, values[1:], strict=False):
+            each.append(ast.Compare(self.visit(deepcopy(a)), [op], [self.visit(deepcopy(b))]))
         return each[0] if len(each) == 1 else ast.BoolOp(ast.And(), each)
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         name = node.func.id if isinstance(node.func, ast.Name) and node.func.id not in self._scope else None
         given = [self.visit(argument) for argument in node.args]
         if name in _CALLS:
-            return ast.Call(ast.Name(_CALLS[name], ast.Load()), given, [])
+            return _call(_CALLS[name], *given)
         if name == "pow" and len(given) == 2:
             return ast.BinOp(given[0], ast.Pow(), given[1])
         if name in ("min", "max") and len(given) > 2:
             while len(given) > 1:
-                given = [ast.Call(ast.Name(name, ast.Load()), given[:2], []), *given[2:]]
+                given = [_call(name, *given[:2]), *given[2:]]
             return given[0]
         keywords = [ast.keyword(one.arg, self.visit(one.value)) for one in node.keywords]
         return ast.Call(self.visit(node.func), given, keywords)
@@ -181,9 +171,8 @@ class InPrecision(ast.NodeTransformer):
     def _index(self, node: ast.expr) -> int:
         number = self._whole(node)
         if number is None:
-            found = f"{self._what} has the index {ast.unparse(node)}"
             wanted = "whole numbers there, or what follows from the counts of its loops"
-            raise InputError(f"{found}, but must have {wanted}.")
+            raise InputError(f"{self._what} has the index {ast.unparse(node)}, but must have {wanted}.")
         return number
 
     def _whole(self, node: ast.expr) -> int | None:
@@ -215,16 +204,20 @@ class InPrecision(ast.NodeTransformer):
         return float if node.id == "float" else self._counts.get(node.id, self._scope.get(node.id))
 
 
-def _number(node: ast.expr, value: Any) -> ast.AST:
+def _call(name: str, *given: ast.expr) -> ast.Call:
+    return ast.Call(ast.Name(name, ast.Load()), [*given], [])
+
+
+def _number(node: ast.expr, value: Any) -> ast.expr:
     if type(value) in (wp.vec3f, wp.vec3d):
-        return ast.Call(ast.Name(VECTOR, ast.Load()), [ast.Constant(float(part)) for part in value], [])
+        return _call(VECTOR, *(ast.Constant(float(part)) for part in value))
     if isinstance(value, (bool, np.bool_)):
         return ast.Constant(bool(value))
     if type(value) in wp._src.types.scalar_types:
         value = value.value
     if not isinstance(value, (int, float, np.integer, np.floating)):
         return node
-    return ast.Call(ast.Name(REAL, ast.Load()), [ast.Constant(float(value))], [])
+    return _call(REAL, ast.Constant(float(value)))
 
 
 MOST_TURNS = 256
@@ -245,7 +238,8 @@ def text_for_warp(
     DerivativeCheck(what, MOST_TURNS).visit(function)
     local = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     own = local | {argument.arg for argument in function.args.args}
-    check_returns(what, function, kind)
+    if not returns(function.body):
+        raise InputError(f"{what} may end without return, but must return a {kind}, whatever its arguments are.")
     check_names(what, function, own, frozen.scope)
     check_calls(what, function, own, frozen.scope)
     check_truths(what, function)
@@ -272,11 +266,12 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
         if root not in scope and root in BUILTINS:
             if name == "round" and len(node.args) + len(node.keywords) != 1:
                 raise InputError(f"{what} rounds to digits, but must have round of one number alone.")
-        elif not _is_of_warp(called):
-            raise InputError(
-                f"{what} cannot be compiled: it calls {name}, but may only call functions of Warp, functions under "
-                f"@wp.func, {', '.join(BUILTINS)}, and functions of math that Warp has too."
-            )
+        elif not isinstance(called, wp.Function) and called is not float:
+            package = str(getattr(called, "__module__", None) or "").partition(".")[0]
+            if package != "warp" and not (package == "math" and called.__name__ in MATH):
+                wanted = f"functions under @wp.func, {', '.join(BUILTINS)}, and functions of math that Warp has too"
+                found = f"{what} cannot be compiled: it calls {name}"
+                raise InputError(f"{found}, but may only call functions of Warp, {wanted}.")
 
 
 def check_truths(what: str, function: ast.FunctionDef) -> None:
@@ -289,7 +284,11 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
             tests.update(node.values)
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             tests.add(node.operand)
-    truths = {name for name, values in _assigned(function).items() if all(_is_truth(v, set()) for v in values)}
+    assigned: dict[str, list[ast.expr]] = {}
+    for node in ast.walk(function):
+        for target in node.targets if isinstance(node, ast.Assign) else ():
+            assigned.setdefault(ast.unparse(target), []).append(node.value)
+    truths = {name for name, values in assigned.items() if all(_is_truth(value, set()) for value in values)}
     for node in ast.walk(function):
         if isinstance(node, ast.BoolOp) and node not in tests and not _is_truth(node, truths):
             found = f"{what} has {ast.unparse(node)!r}, which is an operand in Python but True or False in Warp"
@@ -299,10 +298,11 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
 def check_helper(what: str, function: ast.FunctionDef) -> None:
     """Raise `InputError` for code in a ``@wp.func`` function that means something different in Python."""
     check_truths(what, function)
-    wholes = set(counts_of(function))
+    targets = [node.target for node in ast.walk(function) if isinstance(node, ast.For)]
+    wholes = {target.id for target in targets if isinstance(target, ast.Name)}
     for node in ast.walk(function):
         of = getattr(node, "op", None)
-        if isinstance(of, (ast.Mod, ast.FloorDiv)) or (isinstance(of, ast.Div) and _is_of_wholes(node, wholes)):
+        if isinstance(of, (ast.Mod, ast.FloorDiv)) or (isinstance(of, ast.Div) and _is_whole(node, wholes)):
             wanted = "wp.mod, wp.floor, wp.rint and numbers with a point"
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("round", "builtins.round"):
             wanted = "wp.rint, or wp.round, which rounds halves away from 0"
@@ -312,28 +312,16 @@ def check_helper(what: str, function: ast.FunctionDef) -> None:
         raise InputError(f"{found}, but must say what is meant, by {wanted}.")
 
 
-def _is_of_wholes(node: ast.AST, wholes: set[str]) -> bool:
-    return isinstance(node, ast.BinOp) and all(_is_whole(part, wholes) for part in (node.left, node.right))
-
-
-def _is_whole(node: ast.expr, wholes: set[str]) -> bool:
+def _is_whole(node: ast.AST, wholes: set[str]) -> bool:
     if isinstance(node, ast.Constant):
         return type(node.value) is int
     if isinstance(node, ast.BinOp):
-        return _is_of_wholes(node, wholes)
+        return _is_whole(node.left, wholes) and _is_whole(node.right, wholes)
     if isinstance(node, ast.UnaryOp):
         return _is_whole(node.operand, wholes)
     if isinstance(node, ast.Call):
         return ast.unparse(node.func) in ("int", "wp.int32", "wp.int64")
     return isinstance(node, ast.Name) and node.id in wholes
-
-
-def _assigned(function: ast.FunctionDef) -> dict[str, list[ast.expr]]:
-    found: dict[str, list[ast.expr]] = {}
-    for node in ast.walk(function):
-        for target in node.targets if isinstance(node, ast.Assign) else ():
-            found.setdefault(ast.unparse(target), []).append(node.value)
-    return found
 
 
 def _is_truth(node: ast.expr, truths: set[str]) -> bool:
@@ -355,10 +343,3 @@ def _found(node: ast.expr, scope: Mapping[str, Any]) -> Any:
         owner = _found(node.value, scope)
         return getattr(owner, node.attr, wp._src.context.builtin_functions.get(node.attr) if owner is wp else None)
     return scope.get(node.id, getattr(builtins, node.id, None)) if isinstance(node, ast.Name) else None
-
-
-def _is_of_warp(called: Any) -> bool:
-    if isinstance(called, wp.Function) or called is float:
-        return True
-    name = getattr(called, "__module__", None) or ""
-    return name.partition(".")[0] == "warp" or (name == "math" and called.__name__ in MATH)

@@ -26,13 +26,13 @@ import warp as wp
 from cortado.device.modules import kernel_module
 from cortado.errors import InputError, shown
 
-_SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
+SENT: WeakKeyDictionary[FunctionType, str] = WeakKeyDictionary()
+"""Source codes of functions that came from another process."""
 _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
 
 
 def plain_function(kind: str, function: Any) -> FunctionType:
-    """Return the plain Python function of a user's function, which may be a Warp function. Raise `InputError` for any
-    other object."""
+    """Return the Python function of a user's function or Warp function. Raise `InputError` for any other object."""
     plain = function.func if isinstance(function, wp.Function) else function
     if not isinstance(plain, FunctionType):
         raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
@@ -50,17 +50,12 @@ def check_bare(what: str, function: Any) -> None:
 
 def source_of(what: str, function: FunctionType) -> str:
     """Return the source code of a function. Raise `InputError` if it cannot be found."""
-    if function in _SENT:
-        return _SENT[function]
+    if function in SENT:
+        return SENT[function]
     try:
         return textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError) as error:
-        found = f"the text of {what} is not to be found"
-        raise InputError(f"{found}, but must stand in a file or a notebook.") from error
-
-
-def keep_source(function: FunctionType, source: str) -> None:
-    _SENT[function] = source
+        raise InputError(f"the text of {what} is not to be found, but must stand in a file or a notebook.") from error
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
@@ -112,13 +107,10 @@ def _same(one: Any, other: Any) -> bool:
 
 def _instructions(code: CodeType) -> list[tuple[str, Any]]:
     steps = [step for step in dis.get_instructions(code) if step.opname not in _LEFT_OUT]
-    places = [step.offset for step in steps]
-    found = []
-    for step in steps:
-        jumps = step.opcode in dis.hasjrel or step.opcode in dis.hasjabs
-        name = step.opname.replace("LOAD_METHOD", "LOAD_ATTR")
-        found.append((name, bisect_left(places, step.argval) if jumps else step.argval))
-    return found
+    places, jumps = [step.offset for step in steps], (*dis.hasjrel, *dis.hasjabs)
+    names = (step.opname.replace("LOAD_METHOD", "LOAD_ATTR") for step in steps)
+    values = (bisect_left(places, step.argval) if step.opcode in jumps else step.argval for step in steps)
+    return list(zip(names, values, strict=True))
 
 
 class Frozen:
@@ -137,8 +129,15 @@ class Frozen:
         return {name: self._value(value, names_in(function)) for name, value in read_by(function).items()}
 
     def _value(self, value: Any, names: tuple[str, ...]) -> Any:
-        if isinstance(value, wp.Function):
-            return self._helper(value) if value.func else value
+        if isinstance(value, wp.Function) and value.func:
+            if id(value) not in self._made:
+                self._made[id(value)] = value  # where it calls itself
+                forms = [*value.user_overloads.values(), *value.user_templates.values()]
+                first, *others = [self._copy(one) for one in forms if one.generic_parent is None]
+                for one in others:
+                    first.add_overload(one)
+                self._made[id(value)] = first
+            return self._made[id(value)]
         if package_of(value) in KEPT:
             return value if ismodule(value) or callable(value) else deepcopy(value)
         if callable(value) and not isclass(value):
@@ -149,16 +148,6 @@ class Frozen:
                 if hasattr(value, name):
                     setattr(made, name, self._value(getattr(value, name), names))
         return self._made[key]
-
-    def _helper(self, helper: Any) -> Any:
-        if id(helper) not in self._made:
-            self._made[id(helper)] = helper  # where it calls itself
-            forms = [*helper.user_overloads.values(), *helper.user_templates.values()]
-            made = [self._copy(one) for one in forms if one.generic_parent is None]
-            for one in made[1:]:
-                made[0].add_overload(one)
-            self._made[id(helper)] = made[0]
-        return self._made[id(helper)]
 
     def _copy(self, helper: Any) -> Any:
         own = self._function(helper)
@@ -183,16 +172,14 @@ class Frozen:
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """Raises an error for code with wrong derivatives in Warp: loops that are not unrolled, and changes of single
-    components."""
+    """Raises an error for code with wrong derivatives in Warp: loops not unrolled, and changes of single components."""
 
     def __init__(self, what: str, most: int = wp.config.max_unroll):
         self._what, self._most = what, most
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        loops = [
-            one.target.id for one in ast.walk(node) if isinstance(one, ast.For) and isinstance(one.target, ast.Name)
-        ]
+        targets = [one.target for one in ast.walk(node) if isinstance(one, ast.For)]
+        loops = [target.id for target in targets if isinstance(target, ast.Name)]
         named = [one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)]
         named += [argument.arg for argument in node.args.args]
         if twice := [name for name in loops if named.count(name) > loops.count(name)]:
@@ -209,8 +196,7 @@ class DerivativeCheck(ast.NodeVisitor):
 
     def _refuse_part(self, node: ast.Subscript | ast.Attribute) -> None:
         if isinstance(node.ctx, ast.Store):
-            part = ast.unparse(node)
-            found = f"{self._what} changes {part} alone, which Warp cannot differentiate"
+            found = f"{self._what} changes {ast.unparse(node)} alone, which Warp cannot differentiate"
             raise InputError(f"{found}, but must make vectors whole, as in wp.vec3(a, b, c).")
         self.generic_visit(node)
 
@@ -226,16 +212,10 @@ class DerivativeCheck(ast.NodeVisitor):
     visit_While = visit_Break = visit_Continue = _refuse
 
 
-def check_returns(what: str, function: ast.FunctionDef, kind: str) -> None:
-    """Raise `InputError` for a function that may end without returning a value."""
-    if not _returns(function.body):
-        raise InputError(f"{what} may end without return, but must return a {kind}, whatever its arguments are.")
-
-
-def _returns(body: list[ast.stmt]) -> bool:
+def returns(body: list[ast.stmt]) -> bool:
     last = body[-1]
     if isinstance(last, ast.If):
-        return _returns(last.body) and bool(last.orelse) and _returns(last.orelse)
+        return returns(last.body) and bool(last.orelse) and returns(last.orelse)
     return isinstance(last, ast.Return) and last.value is not None
 
 
@@ -249,11 +229,6 @@ def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
         if isinstance(scope.get(node.id), (list, tuple, dict, str, np.ndarray)):
             found = f"{what} has the name {node.id}, which is a {type(scope[node.id]).__name__} outside of it"
             raise InputError(f"{found}, but must take a number or a vector: make it a parameter of the function.")
-
-
-def counts_of(function: ast.FunctionDef) -> list[str]:
-    targets = [node.target for node in ast.walk(function) if isinstance(node, ast.For)]
-    return [target.id for target in targets if isinstance(target, ast.Name)]
 
 
 class SizesWritten(ast.NodeTransformer):
@@ -301,7 +276,10 @@ def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | Non
     if ismethod(value):
         return [*words(value.__func__, names, seen), *words(value.__self__, names_in(value.__func__), seen)]
     name, package = str(getattr(value, "__qualname__", type(value).__qualname__)), package_of(value)
-    if (id(value), names) in seen or isclass(value) or package in KEPT or _is_told_by_name(value):
+    file = value.__code__.co_filename if isfunction(value) else ""
+    is_known = package in KEPT or (file.startswith(PYTHON) and "site-packages" not in file)
+    is_known |= package == "cortado" and (ismodule(value) or isfunction(value))
+    if (id(value), names) in seen or isclass(value) or is_known:
         return [value.__name__ if ismodule(value) else name]
     seen.add((id(value), names))
     if isfunction(value):
@@ -332,12 +310,6 @@ def _parts(value: Any) -> Any:
     return value if isfunction(value) else getattr(value, "__wrapped__", value)  # of functools.cache
 
 
-def _is_told_by_name(value: Any) -> bool:
-    file = value.__code__.co_filename if isfunction(value) else ""
-    is_python = file.startswith(PYTHON) and "site-packages" not in file
-    return is_python or (package_of(value) == "cortado" and (ismodule(value) or isfunction(value)))
-
-
 def _of_code(code: CodeType) -> list[str]:
     consts = [word for one in code.co_consts for word in (_of_code(one) if isinstance(one, CodeType) else words(one))]
     return [code.co_code.hex(), *code.co_names, *code.co_varnames, *consts]
@@ -356,9 +328,5 @@ def names_in(function: Any) -> tuple[str, ...]:
 
 
 def package_of(value: Any) -> str:
-    name = (
-        value.__name__
-        if ismodule(value)
-        else (value if isclass(value) or isfunction(value) else type(value)).__module__
-    )
-    return str(name).partition(".")[0]
+    owner = value if isclass(value) or isfunction(value) else type(value)
+    return str(value.__name__ if ismodule(value) else owner.__module__).partition(".")[0]

@@ -107,18 +107,17 @@ class MixtureTangent(PartTangent):
         self._c_dot, self._chi_dot, self._w_dot = [part.fractions() for _ in range(2)], part.fractions(), part.numbers()
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        mixture, kernels, diffusion, known = self.part, self.part.kernels, self.part.diffusion, dot.named
+        mixture, kernels, known = self.part, self.part.kernels, dot.named
         substeps, now = mixture.substeps, {"chi_dot": self._chi_dot, "w_dot": self._w_dot}
         course = [*(self._c_dot[k % 2] for k in range(substeps)), dot.fractions]
         if mixture.phases.count > 1:
             step.launch(kernels.order.sort, a_scene=state_dot.mass_fractions, a=course[0])
         for k in range(substeps):
-            assert diffusion is not None
             c_dot, c_new_dot = course[k : k + 2]
             given = {"strength": mixture.phases.strength, "c": mixture.c[k], "c_dot": c_dot}
-            step.launch(diffusion.potential.tangent, *known, **given, **now)
+            step.launch(mixture.diffusion.potential.tangent, *known, **given, **now)
             flux = {"chi": mixture.chi[k], "w": mixture.w[k], "c_dot": c_dot, "c_new_dot": c_new_dot}
-            step.launch(diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
+            step.launch(mixture.diffusion.flux.tangent, *known, substeps=substeps, **flux, **now)
         step.launch(kernels.blend.tangent, *known, c=step.fractions, c_dot=dot.fractions)
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
@@ -133,23 +132,20 @@ class MixtureAdjoint(PartAdjoint):
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
         """Convert the adjoint of the new mass fractions to the adjoint of the old mass fractions, in scene order."""
-        with step.aside() if not self.part.substeps else nullcontext():
-            self._unmix(step, bar, state_bar.mass_fractions)
-
-    def _unmix(self, step: StepContext, bar: Adjoints, fractions_bar: wp.array) -> None:
-        mixture, kernels, diffusion, known = self.part, self.part.kernels, self.part.diffusion, bar.named
-        substeps, strength, c_bar, y, z = mixture.substeps, mixture.phases.strength, bar.fractions, self._y, self._z
-        step.launch(kernels.blend.adjoint, *known, c=step.fractions, c_scene_bar=fractions_bar, c_bar=c_bar)
-        for k in reversed(range(substeps)):
-            assert diffusion is not None
-            scale, flux = diffusion.flux.adjoint
-            c, chi, w = mixture.c[k], mixture.chi[k], mixture.w[k]
-            step.launch(scale, substeps=substeps, c_bar=c_bar, y=y)
-            step.launch(flux, *known, strength=strength, c=c, chi=chi, w=w, y=y, c_bar=c_bar, z=z)
-            step.launch(diffusion.potential.adjoint, *known, c=c, z=z, c_bar=c_bar)
-        if mixture.phases.count > 1:
-            step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
-            c_bar.zero_()
+        mixture, kernels, known, fractions_bar = self.part, self.part.kernels, bar.named, state_bar.mass_fractions
+        substeps, c_bar, y, z = mixture.substeps, bar.fractions, self._y, self._z
+        with nullcontext() if substeps else step.aside():
+            step.launch(kernels.blend.adjoint, *known, c=step.fractions, c_scene_bar=fractions_bar, c_bar=c_bar)
+            for k in reversed(range(substeps)):
+                now = {"c": mixture.c[k], "c_bar": c_bar, "z": z}
+                scale, flux = mixture.diffusion.flux.adjoint
+                step.launch(scale, substeps=substeps, c_bar=c_bar, y=y)
+                at = {"strength": mixture.phases.strength, "chi": mixture.chi[k], "w": mixture.w[k], "y": y}
+                step.launch(flux, *known, at, now)
+                step.launch(mixture.diffusion.potential.adjoint, *known, now)
+            if mixture.phases.count > 1:
+                step.launch(kernels.order.unsort, a=c_bar, a_scene=fractions_bar)
+                c_bar.zero_()
 
 
 class Mixture(Part):
@@ -195,7 +191,7 @@ class Mixture(Part):
             if self.phases.count > 1:
                 step.launch(self.kernels.order.sort, a_scene=state.mass_fractions, a=self.course(step)[0])
             if not self.substeps:
-                self._blend(step)
+                step.launch(self.kernels.blend.forward, c=step.fractions)
 
     def settle(self, step: StepContext) -> None:
         course = self.course(step)
@@ -205,10 +201,7 @@ class Mixture(Part):
             step.launch(self.diffusion.potential.forward, strength=self.phases.strength, **now)
             step.launch(self.diffusion.flux.forward, substeps=self.substeps, c_new=course[k + 1], **now)
         if self.substeps:
-            self._blend(step)
-
-    def _blend(self, step: StepContext) -> None:
-        step.launch(self.kernels.blend.forward, c=step.fractions)
+            step.launch(self.kernels.blend.forward, c=step.fractions)
 
     def end(self, step: StepContext, state: State, moved: State) -> None:
         if self.phases.count > 1:

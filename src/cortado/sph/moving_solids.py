@@ -121,20 +121,9 @@ def move_kernels(precision: Precision) -> Kernels:
 
     @TypesByName(real, {vector: vectors, matrix: "inertia inverse turns", hold.kind: "hold"})
     def move(
-        time_step_i,
-        gravity_i,
-        density_i,
-        volume,
-        inertia,
-        inverse,
-        hold,
-        turns_i,
-        V_0_i,
-        W_0_i,
-        L_0_i,
-        pulled_sum_i,
+        time_step_i, gravity_i, density_i, volume, inertia, inverse, hold, turns_i, V_0_i, W_0_i, L_0_i, pulled_sum_i,
         twisted_sum_i,
-    ) -> tuple[vector, vector, vector, vector, vector]:
+    ) -> tuple[vector, vector, vector, vector, vector]:  # fmt: skip
         arm = turns_i * hold.arm
         L = L_0_i + twisted_sum_i - wp.cross(arm, pulled_sum_i)
         W = spin(turns_i, inertia, inverse, L, hold) / density_i
@@ -199,8 +188,7 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 
 @cache
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a moving solid in 2 or 3 dimensions: for its poses before and after a step, and for its
-    state."""
+    """Make the kernels of a moving solid in 2 or 3 dimensions, for its poses before and after a step and its state."""
     real, vector, matrix, of = precision.real, precision.vector, precision.matrix, rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
@@ -222,10 +210,8 @@ def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     turned = {"turns": "turned", "turns_before": "turned_before"}
     poses, written = ["before", "turns_before", "after", "turns", "scales"], ["position", "turn"]
     ends, kept = [f"{name}_new" for name in FIELDS], {f"{name}_new": name for name in ("rotation", "scale")}
-    return (
-        pointwise_kernels(precision, modules, lambda _: pose, poses, written=written, told=told, turned=turned),
-        pointwise_kernels(precision, modules, lambda _: end, ends, kept, told=told),
-    )
+    begins = pointwise_kernels(precision, modules, lambda _: pose, poses, written=written, told=told, turned=turned)
+    return begins, pointwise_kernels(precision, modules, lambda _: end, ends, kept, told=told)
 
 
 @dataclass(frozen=True)

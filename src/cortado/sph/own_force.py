@@ -7,6 +7,7 @@ Tangents and adjoints are exact, from Warp's derivatives of the function.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache, cached_property
 from hashlib import sha256
 from typing import Any, ClassVar
@@ -26,12 +27,12 @@ from cortado.particles.particle_kernels import pointwise_kernels, sum_kernels
 from cortado.particles.state import padded
 from cortado.scene.courses import Knots
 from cortado.scene.parameter_values import TIME, Arrays
-from cortado.scene.parameters import Axis, Parameter, Source
+from cortado.scene.parameters import Axis, Parameter
 from cortado.scene.scene import Scene
 from cortado.sph.formula import READ_AS, Formula, OwnParameters, applied, compiled, formula, theta_of
-from cortado.sph.function_text import keep_source, plain_function, source_of
+from cortado.sph.function_text import SENT, plain_function, source_of
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import Law, check_law
+from cortado.sph.stress_forces import check_law
 from cortado.sph.stress_kernels import VelocityGradients, gradient_functions
 from cortado.sph.viscous_stress import ViscousStress, stress_of
 
@@ -90,12 +91,16 @@ class OwnFunction(ABC):
         self._formula, values = formula(self.kind, self._function, self._source, parameters)
         self.name = self._formula.name if name is None else name
         if not isinstance(self.name, str) or not self.name.isidentifier():
-            raise InputError(
-                f"{self.kind} has the name {shown(name)}, but must have a name as Python's variables have."
-            )
-        self._values = {argument: self._value(argument, value) for argument, value in values.items()}
+            found = f"{self.kind} has the name {shown(name)}"
+            raise InputError(f"{found}, but must have a name as Python's variables have.")
+        self._values = {
+            argument: value if isinstance(value, OverTime) else read_only(f"parameter {self.name}.{argument}", value)
+            for argument, value in values.items()
+        }
         own = tuple(self._parameter(argument, value) for argument, value in self._values.items())
         self.parameters = ((TIME,) if len(self._formula.inputs) == 3 else ()) + own
+        ranks = tuple(one.rank for one in self.parameters if one.axis is not Axis.ARRAY)
+        self._formula, self._what = replace(self._formula, ranks=ranks), f"{self.kind} function {self._formula.name}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _made_again, (type(self), self._function, self._source, self.name, self._values, self.fingerprint)
@@ -111,45 +116,37 @@ class OwnFunction(ABC):
         words = (self.kind, self.name, self._formula.text, self._formula.outside, *courses)
         return sha256("\n".join(words).encode()).hexdigest()
 
-    def _value(self, argument: str, value: Any) -> Any:
-        return value if isinstance(value, OverTime) else read_only(f"parameter {self.name}.{argument}", value)
-
     def _parameter(self, argument: str, value: Any) -> Parameter:
         name, meaning = f"{self.name}.{argument}", f"{argument} of the force {self.name}"
+        own: dict[str, Any] = {}
         if argument in self._formula.arrays:
-            return Parameter(name, "", meaning, Axis.ARRAY, lambda source: value, change=_usual, shape=value.shape)
+            own |= {"shape": value.shape, "change": lambda source, value: float(np.sqrt(np.mean(value**2))) or 1.0}
+            return Parameter(name, "", meaning, Axis.ARRAY, lambda source: value, **own)
         course = value if isinstance(value, OverTime) else None
         first = value if course is None else course.values[0]
-        axis, components = Axis.STEP if course else Axis.SCALAR, _dimension if first.ndim else None
-        own: dict[str, Any] = {"components": components, "change": _length if first.ndim else _size, "course": course}
-        return Parameter(name, "", meaning, axis, lambda source: first, **own)
+        own |= {"course": course, "change": lambda source, value: np.where(value == 0.0, 1.0, np.abs(value))}
+        if first.ndim:
+            own["components"] = lambda dimension, phases: dimension
+            own["change"] = lambda source, value: float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0
+        return Parameter(name, "", meaning, Axis.STEP if course else Axis.SCALAR, lambda source: first, **own)
 
     @abstractmethod
     def force(self, setting: Setting) -> Force:
         """Make the force in a solver. Raise `InputError` for a function that Warp cannot compile."""
 
-    @property
-    def _what(self) -> str:
-        return f"{self.kind} function {self._formula.name}"
-
-    @property
-    def _ranks(self) -> tuple[int, ...]:
-        return tuple(p.rank for p in self.parameters if p.axis is not Axis.ARRAY)
-
 
 class OwnForce(OwnFunction):
-    _made_by: ClassVar[Callable[[Discretisation, Formula, tuple[int, ...], int], Kernels]]
+    _made_by: ClassVar[Callable[[Discretisation, Formula, int], Kernels]]
     """Function that makes the kernels of the force in 2 or 3 dimensions."""
 
     def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
         """Make the kernels of the force."""
-        return type(self)._made_by(discretisation, self._formula.of_phases(self._what, phases), self._ranks, dimension)
+        return type(self)._made_by(discretisation, self._formula.of_phases(self._what, phases), dimension)
 
     def force(self, setting: Setting) -> "FunctionForce":
         kernels = self.kernels(setting.discretisation, setting.scene.dimension, setting.layout.phases)
-        made = FunctionForce(self._what, kernels, self.parameters, self._formula.fields, setting)
-        made.compile(kernels.forward)
-        return made
+        compiled(self._what, kernels.forward.module, setting.layout.device)
+        return FunctionForce(self._what, kernels, self.parameters, self._formula.fields, setting)
 
 
 class FunctionForce:
@@ -164,17 +161,15 @@ class FunctionForce:
         takes_gradients = not {"shear_rate", "velocity_gradient"}.isdisjoint(fields)
         self._gradients = VelocityGradients(setting) if takes_gradients else None
 
-    def compile(self, kernel: Any) -> Any:
-        compiled(self._what, kernel.module, self._device)
-        return kernel
-
     @cached_property
     def _tangent(self) -> Any:
-        return self.compile(self._kernels.tangent)
+        compiled(self._what, self._kernels.tangent.module, self._device)
+        return self._kernels.tangent
 
     @cached_property
     def _adjoint(self) -> Any:
-        return self.compile(self._kernels.adjoint)
+        compiled(self._what, self._kernels.adjoint.module, self._device)
+        return self._kernels.adjoint
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
         sums = self._gradients.measure(step) if self._gradients else {}
@@ -193,15 +188,15 @@ class FunctionForce:
             self._gradients.adjoint(step, bar)
 
 
-def topic(kind: str, text: Formula, ranks: tuple[int, ...], dimension: int) -> str:
-    words = "\n".join((text.text, text.outside, str(ranks), str(dimension), str(text.phases)))
+def topic(kind: str, text: Formula, dimension: int) -> str:
+    words = "\n".join((text.text, text.outside, str(text.ranks), str(dimension), str(text.phases)))
     return f"{kind}_{text.name}_{sha256(words.encode()).hexdigest()[:12]}"
 
 
 def _made_again(
     made: type[OwnFunction], function: Any, source: str, name: str, values: Mapping[str, Any], fingerprint: str
 ) -> OwnFunction:
-    keep_source(function, source)
+    SENT[function] = source
     found = made(function, name, **values)
     if found.fingerprint != fingerprint:
         said = f"what the {made.kind} function {name} names or calls has changed since the force was made"
@@ -209,28 +204,12 @@ def _made_again(
     return found
 
 
-def _dimension(dimension: int, phases: int) -> int:
-    return dimension
-
-
-def _size(source: Source, value: np.ndarray) -> np.ndarray:
-    return np.where(value == 0.0, 1.0, np.abs(value))
-
-
-def _usual(source: Source, value: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(value**2))) or 1.0
-
-
-def _length(source: Source, value: np.ndarray) -> float:
-    return float(np.linalg.norm(np.atleast_2d(value), axis=-1).max()) or 1.0
-
-
 @cache
-def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
-    precision, modules = discretisation.precision, discretisation.modules(topic("body", text, ranks, dimension))
+def body_kernels(discretisation: Discretisation, text: Formula, dimension: int) -> Kernels:
+    precision, modules = discretisation.precision, discretisation.modules(topic("body", text, dimension))
     gradient, rate = gradient_functions(precision, dimension)
-    types: dict[str, Any] = {"x_i": precision.vector, "v_i": precision.vector, "theta": theta_of(precision, ranks)}
-    kinds = dict.fromkeys(("M_i", "A_i"), precision.matrix) | {"fractions_i": text.fractions(precision)}
+    types: dict[str, Any] = dict.fromkeys(("x_i", "v_i"), precision.vector) | {"theta": theta_of(precision, text.ranks)}
+    kinds = {"M_i": precision.matrix, "A_i": precision.matrix, "fractions_i": precision.fractions(max(text.phases, 1))}
     given = [*types]
     for name in text.fields:
         value, entries = FIELDS[name]
@@ -240,7 +219,7 @@ def body_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int
     types |= reads
 
     def make(module: Any) -> Callable[..., Any]:
-        force = applied(text, precision, ranks, dimension, module)
+        force = applied(text, precision, dimension, module)
         scope: dict[str, Any] = {"force": force, "gradient": gradient, "rate": rate}
         source = f"def body({', '.join(types)}):\n    return force({', '.join([*given, *reads])})\n"
         exec(source, scope)
@@ -281,12 +260,10 @@ class Body(OwnForce):
     kind, _made_by = "Body", staticmethod(body_kernels)
 
 
-def term(
-    discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int, module: Any
-) -> Callable[..., Any]:
+def term(discretisation: Discretisation, text: Formula, dimension: int, module: Any) -> Callable[..., Any]:
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    theta_type, weight = theta_of(precision, ranks), pair_functions(discretisation).weight
-    force = applied(text, precision, ranks, dimension, module)
+    theta_type, weight = theta_of(precision, text.ranks), pair_functions(discretisation).weight
+    force = applied(text, precision, dimension, module)
 
     def pair(x_ij: vector, v_ij: vector, m_i: real, theta: theta_type, i: int, j: int, s: neighbourhood) -> vector:
         acceleration = vector()
@@ -298,12 +275,11 @@ def term(
 
 
 @cache
-def pair_kernels(discretisation: Discretisation, text: Formula, ranks: tuple[int, ...], dimension: int) -> Kernels:
-    own, modules = (text, ranks, dimension), discretisation.modules(topic("pair", text, ranks, dimension))
-    module, tangent_module, adjoint_module = modules
-    accelerations = fluid_sum(discretisation, module=module)(term(discretisation, *own, module))
-    tangents = made_tangent(discretisation, lambda taped: term(taped, *own, tangent_module), tangent_module)
-    adjoints = made_adjoint(discretisation, lambda taped: term(taped, *own, adjoint_module), adjoint_module)
+def pair_kernels(discretisation: Discretisation, text: Formula, dimension: int) -> Kernels:
+    modules = discretisation.modules(topic("pair", text, dimension))
+    accelerations = fluid_sum(discretisation, module=modules[0])(term(discretisation, text, dimension, modules[0]))
+    tangents = made_tangent(discretisation, lambda taped: term(taped, text, dimension, modules[1]), modules[1])
+    adjoints = made_adjoint(discretisation, lambda taped: term(taped, text, dimension, modules[2]), modules[2])
     sums, named = (accelerations, tangents, adjoints), {"before": "acceleration_in", "per": "cell"}
     return sum_kernels("pair_force", modules, sums, "acceleration", **named, numbers=["cell"], written=["theta"])
 
@@ -362,22 +338,18 @@ class Rheology(OwnFunction):
         if "viscosity" in values or any(one.name in values for one in self.parameters):
             self._try(values, simulation.scene, simulation.precision, simulation.device)
 
-    def _law(self, scene: Scene) -> Law:
-        topic_of_law = topic("rheology", self._formula, self._ranks, scene.dimension)
-        return Law(self._formula, self._ranks, f"{topic_of_law}_")
+    def _law(self, scene: Scene) -> Formula:
+        return replace(self._formula, topic=f"{topic('rheology', self._formula, scene.dimension)}_")
 
     def _try(self, values: Arrays, scene: Scene, precision: Precision, device: Any) -> None:
-        own = np.broadcast_to(values.get("viscosity", [phase.viscosity for phase in scene.phase]), len(scene.phase))
-        viscosities = {phase.name: float(value) for phase, value in zip(scene.phase, own, strict=True)}
+        each = np.broadcast_to(values.get("viscosity", [phase.viscosity for phase in scene.phase]), len(scene.phase))
+        viscosities = {phase.name: float(value) for phase, value in zip(scene.phase, each, strict=True)}
         size = values.get("time_step", scene.solver.time_step)
-        thetas = self._thetas(values, 0.0 if isinstance(size, str) else float(size))
-        check_law(self._what, self._law(scene), viscosities, thetas, precision, device)
-
-    def _thetas(self, values: Arrays, time_step: float) -> np.ndarray:
         known = {one.name: one for one in self.parameters}
         own = {name: values.get(f"{self.name}.{name}", value) for name, value in self._values.items()}
         steps = max((len(v) for n, v in values.items() if n in known and v.ndim > known[n].rank), default=0)
         changes = [t for v in own.values() if isinstance(v, OverTime) for t in v.times]
+        time_step = 0.0 if isinstance(size, str) else float(size)
         times = time_step * np.arange(steps) if steps else np.unique([0.0, *changes])
         columns = [times] if len(self._formula.inputs) == 3 else []
         for name, value in own.items():
@@ -385,4 +357,5 @@ class Rheology(OwnFunction):
             is_vector = known[f"{self.name}.{name}"].rank
             rows = np.broadcast_to(found, (len(times), *found.shape[-1:] * is_vector))
             columns += [padded(rows) if is_vector else rows]
-        return np.column_stack([np.zeros((len(times), 0)), *columns])
+        thetas = np.column_stack([np.zeros((len(times), 0)), *columns])
+        check_law(self._what, self._law(scene), viscosities, thetas, precision, device)

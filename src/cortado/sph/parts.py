@@ -65,8 +65,7 @@ class StepContext:
         return {**own, "cell": self.cell, "fractions": self.fractions}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        """Launch a kernel over the particles. The context provides all arguments that are not in ``arguments`` or
-        ``groups``.
+        """Launch a kernel over the particles. The context provides what is not in ``arguments`` or ``groups``.
 
         A kernel with the argument ``s`` takes it first, and works on particle ``s.first + wp.tid()``, because its
         launch may be split into ranges of particles. ``threads`` is for kernels without ``s``.
@@ -101,14 +100,12 @@ class Shares(Arrays):
     """Terms of particles in the adjoints of parameters (n,), before summation."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
-        """Allocate terms of the parameters ``names``, all 0. Raise `TypeError` for a parameter that particles do not
-        share."""
-        precision, self.known = layout.precision, layout.known
+        """Allocate terms of the parameters ``names``, all 0. Raise `TypeError` for one that particles do not share."""
+        precision, self.known, kinds = layout.precision, layout.known, {}
         of_phases = precision.fractions(layout.phases)
         dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
         used = [self.known[name] for name in self.known.run]
         known = {p.name: dtypes[p.axis][p.rank] for p in used if p.axis in dtypes}
-        kinds = {}
         for name in names:
             if name not in known:
                 raise TypeError(f"shares has {name!r}, but must be a tuple of some of {', '.join(known)}.")
@@ -142,14 +139,12 @@ class Adjoints:
         """
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
-        fractions = {"fractions_bar": self.fractions}
-        return self.fields.named("_bar"), fractions, self.shares.named("_bar"), whole
+        return self.fields.named("_bar"), {"fractions_bar": self.fractions}, self.shares.named("_bar"), whole
 
 
 @dataclass(frozen=True)
 class Setting:
-    """The arguments for making a force. A module of a force has a function ``force(setting)``, which returns the force
-    or None."""
+    """The arguments for making a force. A force's module has a function ``force(setting)``, which may return None."""
 
     scene: Scene
     discretisation: Discretisation
@@ -254,17 +249,15 @@ class Part:
     def new_tangent(self) -> PartTangent:
         """Make the tangent of the part. Raise `MissingDerivativeError` without forward mode."""
         if self.derivatives is None:
-            raise MissingDerivativeError(
-                f"{type(self).__name__} has no forward mode: let it have a method new_tangent."
-            )
+            name = type(self).__name__
+            raise MissingDerivativeError(f"{name} has no forward mode: let it have a method new_tangent.")
         return self.derivatives[0](self)
 
     def new_adjoint(self) -> PartAdjoint:
         """Make the adjoint of the part. Raise `MissingDerivativeError` without reverse mode."""
         if self.derivatives is None:
-            raise MissingDerivativeError(
-                f"{type(self).__name__} has no reverse mode: let it have a method new_adjoint."
-            )
+            name = type(self).__name__
+            raise MissingDerivativeError(f"{name} has no reverse mode: let it have a method new_adjoint.")
         return self.derivatives[1](self)
 
 
@@ -281,9 +274,8 @@ class Carried:
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:
-                raise TypeError(
-                    f"field {field.name!r} has one entry, but must have one for each particle to be sorted."
-                )
+                wanted = "one for each particle to be sorted"
+                raise TypeError(f"field {field.name!r} has one entry, but must have {wanted}.")
         self._arrays = layout.state(fields, requires_grad)
 
     def __getitem__(self, name: str) -> wp.array:
@@ -336,8 +328,7 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Return the Warp module for kernels without a smoothing kernel. Use a separate ``topic`` for kernels that only
-    some scenes need."""
+    """Return the Warp module for kernels without a smoothing kernel. Kernels of few scenes need their own ``topic``."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
@@ -405,8 +396,7 @@ def begin_adjoint_kernel(precision: Precision) -> Any:
     """Make the kernel that converts the adjoint of the new state to the adjoint of the predicted state."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_share(precision)
-    vectors = wp.array(dtype=vector)
-    typed = TypesByName(real, {wp.int32: "order", vector: "v", vectors: "x_scene v_scene"})
+    typed = TypesByName(real, {wp.int32: "order", vector: "v", wp.array(dtype=vector): "x_scene v_scene"})
 
     @particle_kernel(integration_module(precision, False), "x_bar v_bar n_bar m_bar rho_0_bar mu_bar time_step_bar")
     @typed

@@ -119,8 +119,7 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
     pulls = pointwise_kernels(precision, modules, lambda _: pull, given, numbers=["spring", "cell"], **names)
     reads = pointwise_kernels(precision, modules, lambda _: read, ["reading"], numbers=["spring"], **names)
     names = {"written": ["R_0", "E_0", "E"], "told": ["torque", "speed"], "numbers": ["hinge", "cell"]}
-    twists = pointwise_kernels(precision, modules, lambda _: twist, given[1::2], turned=TURNED, **names)
-    return pulls, reads, twists
+    return pulls, reads, pointwise_kernels(precision, modules, lambda _: twist, given[1::2], turned=TURNED, **names)
 
 
 class Springs:

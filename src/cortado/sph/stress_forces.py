@@ -20,7 +20,6 @@ A viscosity law returns the viscosity of a fluid from its shear rate. It is a us
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -89,9 +88,8 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient
     summed = rubbing_sum(discretisation, sticks)
-    matrix = precision.matrix
 
-    typed = TypesByName(real, {vector: "x v foot turn bar", matrix: "T", neighbourhood: "s"})
+    typed = TypesByName(real, {vector: "x v foot turn bar", precision.matrix: "T", neighbourhood: "s"})
 
     @typed
     def wall_force(x_ij, v_ij, m_i, T_i, mu_i, control, least, foot, s) -> vector:
@@ -117,24 +115,9 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     @summed(wall_force_tangent, ahead=False, grows=force)
     @typed
     def force_tangent(
-        x_ij,
-        x_dot_ij,
-        v_ij,
-        v_dot_ij,
-        m_i,
-        m_dot_i,
-        T_i,
-        T_j,
-        T_dot_i,
-        T_dot_j,
-        mu_i,
-        mu_j,
-        mu_dot_i,
-        mu_dot_j,
-        control,
-        least,
-        s,
-    ) -> vector:
+        x_ij, x_dot_ij, v_ij, v_dot_ij, m_i, m_dot_i, T_i, T_j, T_dot_i, T_dot_j, mu_i, mu_j, mu_dot_i, mu_dot_j,
+        control, least, s,
+    ) -> vector:  # fmt: skip
         w = weight(x_ij, s)
         w_dot = -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij) - w * m_dot_i / m_i
         T, mu = T_i + T_j, control * (mu_i + mu_j)
@@ -202,32 +185,13 @@ def stress_couple_work(d: Discretisation) -> Any:
     return stress_couple_work
 
 
-@dataclass(frozen=True)
-class Law:
-    """A law of viscosity as a function of the shear rate and of parameters."""
-
-    text: Formula
-    ranks: tuple[int, ...]
-    topic: str
-    """Part of the names of Warp modules; empty for Newtonian fluids."""
-
-    @property
-    def is_newtonian(self) -> bool:
-        return not self.topic
-
-    def applied(self, precision: Precision, module: Any) -> Any:
-        """Make the Warp function of the viscosity [Pa s]. Its arguments are the shear rate [1/s], the phase's viscosity
-        [Pa s] and the parameters."""
-        return applied(self.text, precision, self.ranks, 3, module)
-
-
 def newtonian(shear_rate, viscosity):
     return viscosity
 
 
 @cache
-def newtonian_law() -> Law:
-    return Law(formula("Rheology", plain_function("Rheology", newtonian), inspect.getsource(newtonian), {})[0], (), "")
+def newtonian_law() -> Formula:
+    return formula("Rheology", plain_function("Rheology", newtonian), inspect.getsource(newtonian), {})[0]
 
 
 def power_law(shear_rate, viscosity, flow_index, least_shear_rate):
@@ -270,9 +234,9 @@ SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
 
 
 @cache
-def trial_kernel(precision: Precision, law: Law) -> Any:
+def trial_kernel(precision: Precision, law: Formula) -> Any:
     module = kernel_module(f"{law.topic}trial_{precision.name}")
-    real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), law.applied(precision, module)
+    real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), applied(law, precision, 3, module)
 
     @wp.kernel(module=module, enable_backward=False)
     @TypesByName(real, {theta_type: "thetas"}).arrays
@@ -284,15 +248,16 @@ def trial_kernel(precision: Precision, law: Law) -> Any:
 
 
 def check_law(
-    what: str, law: Law, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
+    what: str, law: Formula, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
 ) -> None:
     """Raise `InputError` if a law returns an invalid viscosity. ``viscosities`` are the viscosities of phases by name,
     and ``thetas`` the parameters of the law."""
-    kernel, rows = trial_kernel(precision, law), np.zeros((len(thetas), theta_of(precision, law.ranks)._length_))
+    kernel, theta_type = trial_kernel(precision, law), theta_of(precision, law.ranks)
+    rows = np.zeros((len(thetas), theta_type._length_))
     rows[:, : thetas.shape[1]] = thetas
     given = {"shear_rates": SHEAR_RATES, "viscosities": np.array(list(viscosities.values()))}
     arrays = {name: wp.array(values, dtype=precision.real, device=device) for name, values in given.items()}
-    arrays["thetas"] = wp.array(rows, dtype=theta_of(precision, law.ranks), device=device)
+    arrays["thetas"] = wp.array(rows, dtype=theta_type, device=device)
     shape = len(SHEAR_RATES), len(viscosities), len(rows)
     found = wp.zeros(shape, dtype=precision.real, device=device)
     launch(kernel, shape, device, **arrays, found=found)

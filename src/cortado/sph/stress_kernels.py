@@ -50,10 +50,10 @@ from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import rubbing_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels, sum_kernel
-from cortado.sph.formula import theta_of
+from cortado.sph.formula import Formula, applied, theta_of
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import Law, contact_functions, newtonian_law, stress_sums, work_types
+from cortado.sph.stress_forces import contact_functions, newtonian_law, stress_sums, work_types
 
 LEAST_VISCOSITY = 1e-12
 """Regularisation of viscosities in harmonic means [Pa s]."""
@@ -108,14 +108,14 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
     return traction
 
 
-def stress_of_particle(precision: Precision, dimension: int, law: Law, module: Any) -> Callable[..., Any]:
+def stress_of_particle(precision: Precision, dimension: int, law: Formula, module: Any) -> Callable[..., Any]:
     """Make the Warp function of the stress and the viscosity of a particle in 2 or 3 dimensions."""
     real, matrix, fluidity = precision.real, precision.matrix, fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
     plane = wp.constant(real(float(dimension == 2)))
     tiny, slowest = wp.constant(real(1e-12)), wp.constant(real(SLOWEST**2))
-    theta_type, apparent = theta_of(precision, law.ranks), law.applied(precision, module)
+    theta_type, apparent = theta_of(precision, law.ranks), applied(law, precision, 3, module)
 
     def stress(
         control: real, theta: theta_type, M_i: matrix, A_i: matrix, A_u_i: matrix, R_i: real, mu_i: real
@@ -228,7 +228,7 @@ def moments_work(d: Discretisation) -> Any:
 
 
 @cache
-def stress_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> SimpleNamespace:
+def stress_kernels(discretisation: Discretisation, dimension: int, law: Formula, sticks: bool) -> SimpleNamespace:
     """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity.
 
     ``moments`` computes sums over neighbours. ``stress`` computes the stress and the viscosity. ``force`` computes the
@@ -299,8 +299,9 @@ def gradient_functions(precision: Precision, dimension: int) -> tuple[Any, Any]:
 
 class VelocityGradients:
     def __init__(self, setting: Setting):
-        self._setting = setting
         self._kernels = stress_kernels(setting.discretisation, setting.scene.dimension, newtonian_law(), False).moments
+        precision = setting.layout.precision
+        self._arrays = partial(setting.layout.arrays, M=precision.matrix, A=precision.matrix, R=precision.real)
         self._sums = self._arrays("", setting.discretisation.taped)
 
     def measure(self, step: StepContext) -> dict[str, wp.array]:
@@ -324,7 +325,3 @@ class VelocityGradients:
     @cached_property
     def _bars(self) -> dict[str, wp.array]:
         return self._arrays("_bar")
-
-    def _arrays(self, suffix: str, requires_grad: bool = False) -> dict[str, wp.array]:
-        layout, matrix = self._setting.layout, self._setting.layout.precision.matrix
-        return layout.arrays(suffix, requires_grad, M=matrix, A=matrix, R=layout.precision.real)

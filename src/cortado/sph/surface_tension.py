@@ -33,7 +33,6 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernel, sum_kernels
 from cortado.particles.state import Layout
-from cortado.scene.scene import Scene
 from cortado.sph.curvature import CurvatureConstants, curvature_kernels, entries
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
@@ -171,8 +170,7 @@ class SurfaceTension:
 
 
 def tension_constants(spacing: float, support: float, dimension: int) -> tuple[float, float]:
-    """Return the factor of surface normals [1 / m] and the factor of the force [1 / m^(d + 2)], computed from a cut
-    lattice."""
+    """Return the factors of surface normals [1 / m] and of the force [1 / m^(d + 2)], from a cut lattice."""
     offsets = lattice_offsets(spacing, support, dimension)
     s = (offsets**2).sum(axis=1) / support**2
     outwards = np.rint(offsets[:, 0] / spacing).astype(int)
@@ -199,18 +197,9 @@ def force(setting: Setting) -> Force:
     if support < least:
         needed = f"surface tension needs at least {least:g} to hold a fluid together"
         warn(f"discretisation.support is {support:g}, but {needed}.")
-    _check_viscosity(scene, setting.layout.particles)
-    if form == "curvature":
-        cut, smoothing = scene.discretisation, setting.discretisation.smoothing
-        known = CurvatureConstants.of(smoothing, cut.spacing, lattice.support, scene.dimension)
-        return CurvatureTension(setting.discretisation, scene.dimension, known, setting.layout)
-    constants = tension_constants(scene.discretisation.spacing, lattice.support, scene.dimension)
-    return SurfaceTension(setting.discretisation, *constants, setting.layout)
-
-
-def _check_viscosity(scene: Scene, particles: int) -> None:
     spacing, tension, dimension = scene.discretisation.spacing, scene.forces.surface_tension, scene.dimension
-    radius = spacing * (particles / (pi if dimension == 2 else 4.0 * pi / 3.0)) ** (1.0 / dimension)
+    unit_ball = pi if dimension == 2 else 4.0 * pi / 3.0
+    radius = spacing * (setting.layout.particles / unit_ball) ** (1.0 / dimension)
     for phase in scene.phase:
         least = LEAST_VISCOSITY * sqrt(phase.rest_density * tension * radius)
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
@@ -220,3 +209,8 @@ def _check_viscosity(scene: Scene, particles: int) -> None:
                 f"tension of {tension:g} N/m it should be at least {least:.2g} Pa s: with less, the surface takes up "
                 "energy and throws out particles."
             )
+    if form == "curvature":
+        known = CurvatureConstants.of(setting.discretisation.smoothing, spacing, lattice.support, dimension)
+        return CurvatureTension(setting.discretisation, dimension, known, setting.layout)
+    constants = tension_constants(spacing, lattice.support, dimension)
+    return SurfaceTension(setting.discretisation, *constants, setting.layout)

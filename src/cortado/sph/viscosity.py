@@ -133,10 +133,8 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         mu_part = per_volume * pair_viscosity_derivative(mu_i, mu_j) * work
         return x_part, v_part, -weight * work * reciprocal(n_i), m_part, mu_part
 
-    sums = force, force_tangent, force_adjoint
-    return sum_kernels(
-        "viscosity", discretisation.modules(name), sums, "acceleration", before="acceleration_in", numbers=["k"]
-    )
+    sums, modules = (force, force_tangent, force_adjoint), discretisation.modules(name)
+    return sum_kernels("viscosity", modules, sums, "acceleration", before="acceleration_in", numbers=["k"])
 
 
 @cache
@@ -162,23 +160,21 @@ class Viscosity:
 
     def __init__(self, setting: Setting):
         discretisation, self.sticks = setting.discretisation, setting.scene.sticks
-        k = 2.0 * (setting.scene.dimension + 2)
+        self._k = 2.0 * (setting.scene.dimension + 2)
         self._kernels = viscosity_kernels(discretisation, self.sticks)
-        self._constants: dict[str, Any] = {"k": k}
-        action = WallSums(viscosity_term(discretisation), setting.layout, (k, 0.0))
+        action = WallSums(viscosity_term(discretisation), setting.layout, (self._k, 0.0))
         self.wall_action = action if self.sticks else None
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        step.launch(self._kernels.forward, **self._constants, acceleration_in=before, acceleration=after)
+        step.launch(self._kernels.forward, k=self._k, acceleration_in=before, acceleration=after)
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        accelerations = {"acceleration_in_dot": before, "acceleration_dot": after}
-        step.launch(self._kernels.tangent, *dot.named, **self._constants, **accelerations)
+        step.launch(self._kernels.tangent, *dot.named, k=self._k, acceleration_in_dot=before, acceleration_dot=after)
         if self.wall_action is not None:
             add(self.wall_action.tangent(step, dot, ALL_WALLS), after)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> None:
-        step.launch(self._kernels.adjoint, *bar.named, **self._constants, acceleration_bar=acceleration_bar)
+        step.launch(self._kernels.adjoint, *bar.named, k=self._k, acceleration_bar=acceleration_bar)
         if self.wall_action is not None:
             self.wall_action.adjoint(step, bar, ALL_WALLS, acceleration_bar, acceleration_bar)
 

@@ -16,15 +16,16 @@ from cortado.device.reduction import add, type_name
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import over, particle_kernel
 from cortado.particles.state import Layout, zeros
+from cortado.sph.formula import Formula
 from cortado.sph.free_friction import FreeFriction
 from cortado.sph.moment_functions import round_off
 from cortado.sph.parts import StepContext
-from cortado.sph.stress_forces import Law, stress_sums
+from cortado.sph.stress_forces import stress_sums
 from cortado.sph.stress_kernels import moment_sums, traction_function
 
 
 @cache
-def operator_kernels(discretisation: Discretisation, dimension: int, law: Law, sticks: bool) -> tuple[Any, Any]:
+def operator_kernels(discretisation: Discretisation, dimension: int, law: Formula, sticks: bool) -> tuple[Any, Any]:
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     module = discretisation.module(False, f"implicit_viscosity_{law.topic}{dimension}d" + "_no_slip" * sticks)
@@ -131,8 +132,7 @@ class Solve:
         self._sums = layout.sum_of(real), layout.sum_of(real)
 
     def __call__(self, step: StepContext, known: Any, r: wp.array, y: wp.array) -> None:
-        """Write the solution to ``y`` (n,), given the right-hand side ``r`` (n,). ``r`` is overwritten. ``known`` are
-        kernel arguments."""
+        """Write the solution to ``y`` (n,), given the right-hand side ``r`` (n,), which is overwritten."""
         kernels, (sum_shares, sum_curvatures), rows = self._kernels, self._sums, self._free.rows
         n, members, sizes = self._layout.all_particles, self._layout.members, {"particles": self._layout.particles}
         own = {**self._own, "w": step.fields["m"], "r": r, "y": y}
@@ -167,12 +167,11 @@ class Solve:
     def _apply(self, step: StepContext, known: Any, p: wp.array) -> None:
         """Write the product of the matrix and ``p``, and each particle's term of its scalar product with ``p``."""
         step.launch(self._pull, *known, v=p)
-        self._free.lean(step, known, p)
+        self._free.pull(step, *known, v=p, solves=True)
         step.launch(self._multiply, *known, self._own, v=p)
         self._free.multiply(step, known, p, self._own)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add to ``r`` the product of the matrix and the velocities of rigid bodies. ``still`` are zero velocities of
-        particles."""
+        """Add to ``r`` the product of the matrix and the bodies' velocities, with ``still`` particles."""
         self._apply(step, known, still)
         add(self._own["product"], r)

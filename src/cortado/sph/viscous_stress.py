@@ -32,10 +32,10 @@ from cortado.scene.parameters import Parameter
 from cortado.scene.scene import Scene
 from cortado.scene.stability import is_implicit
 from cortado.sph.density import WallSums
-from cortado.sph.formula import OwnParameters, compiled
+from cortado.sph.formula import Formula, OwnParameters, compiled
 from cortado.sph.free_friction import FreeFriction
 from cortado.sph.parts import Adjoints, Setting, StepContext, Tangents
-from cortado.sph.stress_forces import Law, newtonian_law, stress_couple_work, stress_work
+from cortado.sph.stress_forces import newtonian_law, stress_couple_work, stress_work
 from cortado.sph.stress_kernels import moments_work, stress_kernels
 from cortado.sph.viscous_solve import Solve, operator_kernels
 
@@ -49,7 +49,7 @@ class ViscousStress:
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
-    def __init__(self, setting: Setting, law: Law | None = None, parameters: Sequence[Parameter] = ()):
+    def __init__(self, setting: Setting, law: Formula | None = None, parameters: Sequence[Parameter] = ()):
         """Prepare the force with a ``law`` of viscosity and its parameters. The default is a Newtonian fluid."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
@@ -62,9 +62,8 @@ class ViscousStress:
         self._of = self.arrays("M", "A", "R", "T", "eta", taped=discretisation.taped)
         self._change = self.arrays("M", "A", "A_u", "R", "T", "eta")
         sums = (stress_work, "acceleration_bar", "rub"), (stress_couple_work, "couple_bar", "couple")
-        self.wall_action, self.wall_couple = (
-            StressWalls(setting, self, *one) if scene.sticks else None for one in sums
-        )
+        walls = (StressWalls(setting, self, *one) if scene.sticks else None for one in sums)
+        self.wall_action, self.wall_couple = walls
 
     def arrays(self, *names: str, taped: bool = False) -> dict[str, wp.array]:
         precision = self._layout.precision
@@ -110,8 +109,7 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """Add to the adjoints of the force's inputs, given the adjoint of the acceleration. ``now`` are the arrays of
-        `resisted`."""
+        """Add to the adjoints of the force's inputs, given that of the acceleration and the arrays of `resisted`."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
@@ -132,7 +130,7 @@ class ViscousStress:
         self._back_to_particles(step, bar, {"A_bar": A_bar}, bars, now)
         self.free.bars.lean(step, bar, A_bar, bars, now)
         self.free.bars.gather(step, bar, {name: bars[name] for name in ("M_bar", "A_bar", "R_bar")})
-        if not (at_the_start or self._law.is_newtonian):
+        if self._law.topic and not at_the_start:
             self._back_to_particles(step, bar, {"A_bar": bars["A_bar"]}, self._no_bars)
         self._own.collect(step, bar)
 
@@ -166,8 +164,7 @@ class StressWalls:
     """The action of walls on particles through the viscous stress."""
 
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
-        """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in the friction with rigid
-        bodies."""
+        """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in `FreeFriction`."""
         self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (stress.constants["least"], stress.constants["control"]))
@@ -230,7 +227,7 @@ class ImplicitViscousStress(ViscousStress):
 
     is_last = True
 
-    def __init__(self, setting: Setting, law: Law | None = None, parameters: Any = ()):
+    def __init__(self, setting: Setting, law: Formula | None = None, parameters: Any = ()):
         if setting.discretisation.taped:
             raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
         super().__init__(setting, law, parameters)
@@ -277,16 +274,14 @@ class ImplicitViscousStress(ViscousStress):
         step.launch(self._implicit.predict, along, acceleration=self._after, u=u_dot)
         self.free.dots.hang(step, dot, u_dot)
         self.free.dots.start(step, dot)
-        change = self._stress_along(step, dot, self._end_along(u_dot))
-        now = {"v": self._u, "v_dot": u_dot, "acceleration_in_dot": before, "acceleration_dot": self._r}
+        end = {"v": self._u, "v_dot": u_dot}
+        change = self._stress_along(step, dot, {**end, "A_u": self._at_end["A"]})
+        now = {**end, "acceleration_in_dot": before, "acceleration_dot": self._r}
         step.launch(self._kernels.force.tangent, now, change, *self._known(*dot.named))
         self.free.dots.push(step, dot, self._r, now, change, *self._known())
         self.solve(step, self._known(), self._r, after)
         self.free.dots.finish(step, dot)
         self._after_dot = after
-
-    def _end_along(self, u_dot: wp.array) -> dict[str, wp.array]:
-        return {"v": self._u, "v_dot": u_dot, "A_u": self._at_end["A"]}
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
         self._find_end(step, self._after)
@@ -299,7 +294,8 @@ class ImplicitViscousStress(ViscousStress):
         step.launch(self._implicit.predict, v=self._r, acceleration=self._after_dot, u=u_dot)
         self.free.dots.hang(step, dot, u_dot)
         self.free.dots.start(step, dot)
-        return {**self._stress_along(step, dot, self._end_along(u_dot)), "v_dot": u_dot}
+        end = {"v": self._u, "v_dot": u_dot, "A_u": self._at_end["A"]}
+        return {**self._stress_along(step, dot, end), "v_dot": u_dot}
 
     def resisted_adjoint(self, step: StepContext, v_bar: wp.array, bar: Adjoints, v_star_bar: wp.array) -> None:
         own = {"v_bar": v_star_bar, "u_bar": v_bar, "acceleration": self._after}
