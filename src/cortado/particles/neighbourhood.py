@@ -131,17 +131,13 @@ def neighbourhood_type(precision: Precision) -> Any:
         count: wp.array(dtype=wp.int32)
         all_count: wp.array(dtype=wp.int32)
         wall_positions: wp.array(dtype=vector)
-        """Positions of wall particles [m]."""
+        """Positions of wall particles [m]. `cortado.particles.moving_walls.WallArrays` describes their other arrays."""
         wall_weights: wp.array(dtype=real)
-        """Weight of a wall particle in the density [-]. The weight of a fluid particle is 1."""
         wall_grips: wp.array(dtype=real)
-        """Weight of a wall particle without slip [-], 0 with free slip."""
         wall_velocities: wp.array(dtype=vector)
         """Velocity of the surface at a wall particle [m/s]."""
         wall_feet: wp.array(dtype=vector)
-        """Vector from a wall particle to the nearest point on the surface [m]."""
         wall_solids: wp.array(dtype=wp.int32)
-        """Number of the solid: 0, 1, ... if it moves, -2, -3, ... if it rests, and -1 for the container."""
         wall_positions_dot: wp.array(dtype=vector)
         """Tangents of the positions of wall particles."""
         wall_velocities_dot: wp.array(dtype=vector)
@@ -184,7 +180,6 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Vector (0, a, b) for each face, where a and b are half the lengths of the face along its two unit vectors
         [m]."""
         wall_faces: wp.array(dtype=wp.int32)
-        """Number of the mirroring face in front of a wall particle, or -1."""
         after: wp.array2d(dtype=vector)
         """Middles of solids after the time step (members, solids) [m]."""
         turns: wp.array2d(dtype=matrix)
