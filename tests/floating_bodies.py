@@ -29,10 +29,8 @@ def floating_box(long: int) -> dict[str, float]:
     run = simulation.run(steps, record_every=max(steps // 200, 1))
     level = len(simulation.positions) * spacing**2 + density / 1000.0 * np.prod(sides)
     drafts = level - (run.solids["box"].positions[:, 1] - 0.5 * sides[1])
-    return {
-        "particles": len(simulation.positions),
-        "draft over the exact one": float(drafts[len(drafts) // 2 :].mean() / wanted),
-    }
+    draft = float(drafts[len(drafts) // 2 :].mean() / wanted)
+    return {"particles": len(simulation.positions), "draft over the exact one": draft}
 
 
 def rings(file: str, inner: float, outer: float, spacing: float) -> None:
@@ -43,6 +41,25 @@ def rings(file: str, inner: float, outer: float, spacing: float) -> None:
     np.save(file, np.concatenate(made))
 
 
+def round_tank(file: str, spacing: float, fluid: dict[str, Any], disc: dict[str, Any], **tables: Any) -> Simulation:
+    """A tank of a radius of 0.45 m, full of fluid from a ``file``, with a free disc of 0.15 m in its middle."""
+    rings(file, 0.15, 0.45, spacing)
+    shape = {"shape": "sphere", "centre": [0.0, 0.0], "slip": disc.get("slip", "free")}
+    scene = Scene(
+        dimension=2,
+        discretisation={"spacing": spacing},
+        phase=[{"name": "fluid", "rest_density": 1000.0, **fluid}],
+        fluid=[{"shape": "points", "file": file, "phase": "fluid"}],
+        container={"shape": "none"},
+        solid=[
+            {"name": "tank", **shape, "radius": 0.45, "side": "inside"},
+            {"name": "disc", **shape, "radius": 0.15, "motion": "free", **disc},
+        ],
+        **tables,
+    )
+    return Simulation(scene, precision="float64")
+
+
 def disc_in_a_round_tank(
     density: float, file: str, spacing: float, steps: int, freedom: Any = None, **solver: Any
 ) -> np.ndarray:
@@ -50,21 +67,9 @@ def disc_in_a_round_tank(
     b = 0.45 m that is full of water in rings, which a ``file`` takes on: over g (rho_0 - rho) / (rho + C rho_0) with
     the added mass C = (b^2 + a^2) / (b^2 - a^2) of theory."""
     inner, outer = 0.15, 0.45
-    rings(file, inner, outer, spacing)
-    round_about = {"shape": "sphere", "centre": [0.0, 0.0]}
-    scene = Scene(
-        dimension=2,
-        discretisation={"spacing": spacing},
-        phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.001}],
-        fluid=[{"shape": "points", "file": file, "phase": "water"}],
-        container={"shape": "none"},
-        solid=[
-            {"name": "tank", **round_about, "radius": outer, "side": "inside"},
-            {"name": "disc", **round_about, "radius": inner, "motion": "free", "density": density, "freedom": freedom},
-        ],
-        solver={"kind": "projection", "time_step": STEP, **solver},
-    )
-    faster = np.diff(Simulation(scene, precision="float64").run(steps, record_every=1).solids["disc"].velocities[:, 1])
+    disc, own = {"density": density, "freedom": freedom}, {"kind": "projection", "time_step": STEP, **solver}
+    simulation = round_tank(file, spacing, {"viscosity": 0.001}, disc, solver=own)
+    faster = np.diff(simulation.run(steps, record_every=1).solids["disc"].velocities[:, 1])
     part = (outer**2 + inner**2) / (outer**2 - inner**2)
     found: np.ndarray = faster / (9.81 * STEP * (1000.0 - density) / (density + 1000.0 * part))
     return found
@@ -100,23 +105,10 @@ def stopping_cylinder(across: int, density: float = 8000.0, viscosity: float = 3
     inner, outer, step, steps = 0.15, 0.45, 0.005, 60
     k = stopping_wave_number(inner, outer, density, viscosity)
     with TemporaryDirectory() as folder:
-        rings(f"{folder}/rings.npy", inner, outer, 2.0 * inner / across)
-        round_about = {"shape": "sphere", "centre": [0.0, 0.0], "slip": "no"}
-        disc = {"name": "disc", **round_about, "radius": inner, "motion": "free", "density": density}
-        scene = Scene(
-            dimension=2,
-            discretisation={"spacing": 2.0 * inner / across},
-            phase=[{"name": "syrup", "rest_density": 1000.0, "viscosity": viscosity}],
-            fluid=[{"shape": "points", "file": f"{folder}/rings.npy", "phase": "syrup"}],
-            container={"shape": "none"},
-            solid=[
-                {"name": "tank", **round_about, "radius": outer, "side": "inside"},
-                {**disc, "angular_velocity": 1.0},
-            ],
-            forces={"gravity": [0.0, 0.0]},
-            solver={"kind": "projection", "time_step": step},
-        )
-        simulation = Simulation(scene, precision="float64")
+        disc = {"slip": "no", "density": density, "angular_velocity": 1.0}
+        tables = {"forces": {"gravity": [0.0, 0.0]}, "solver": {"kind": "projection", "time_step": step}}
+        file, spacing = f"{folder}/rings.npy", 2.0 * inner / across
+        simulation = round_tank(file, spacing, {"viscosity": viscosity}, disc, **tables)
         x, y = simulation.positions.T
         r = np.hypot(x, y)
         speed = inner * _mode(k * r, k * outer) / _mode(k * inner, k * outer)
@@ -134,15 +126,9 @@ def settling_disc(across: int, step: float, duration: float, device: str = "cpu"
     radius, viscosity, density, wide, high = 0.05, 100.0, 3000.0, 0.3, 0.6
     disc = {"name": "disc", "shape": "sphere", "centre": [0.5 * wide, 0.6 * high], "radius": radius, "slip": "no"}
     spacing = 2.0 * radius / across
-    scene = Scene(
-        dimension=2,
-        discretisation={"spacing": spacing},
-        phase=[{"name": "syrup", "rest_density": 1000.0, "viscosity": viscosity}],
-        fluid=[box([0.0, 0.0], [wide, high], phase="syrup")],
-        container=box([0.0, 0.0], [wide, high + 4.0 * spacing], slip="no"),
-        solid=[{**disc, "motion": "free", "density": density}],
-        solver={"kind": "projection", "time_step": step},
-    )
+    room = box([0.0, 0.0], [wide, high + 4.0 * spacing], slip="no")
+    solver, disc = {"kind": "projection", "time_step": step}, {**disc, "motion": "free", "density": density}
+    scene = pool([wide, high], [wide, high], spacing, viscosity, container=room, solid=[disc], solver=solver)
     k = 2.0 * radius / wide
     part = -np.log(k) - 0.9157 + 1.7244 * k**2 - 1.7302 * k**4 + 2.4056 * k**6 - 4.5913 * k**8
     return sinking(scene, (density - 1000.0) * 9.81 * radius**2 * part / (4.0 * viscosity), duration, device)
@@ -160,13 +146,8 @@ def sinking(
     step = scene.solver.time_step if settling is None else 4.0 * scene.solver.time_step
     first = steps if settling is None else round(settling / step)
     settled = simulation.run(first, {f"{name}.density": 1000.0, "time_step": step}, record_every=first)
-    run = simulation.run(
-        steps,
-        {f"{name}.density": density},
-        state=settled.last_state,
-        record_every=steps,
-        sensors={"body": BodyMotion(name)},
-    )
+    options = {"state": settled.last_state, "record_every": steps, "sensors": {"body": BodyMotion(name)}}
+    run = simulation.run(steps, {f"{name}.density": density}, **options)
     late = run.sensors["body"]["velocity_y"][3 * steps // 4 :]
     course = np.polyval(np.polyfit(np.arange(len(late)), late, 2), np.arange(len(late)))
     return {
@@ -181,30 +162,3 @@ def passing(times: np.ndarray, heights: np.ndarray) -> np.ndarray:
     """When something that swings goes through 0 upwards."""
     k = np.nonzero((heights[:-1] < 0.0) & (heights[1:] >= 0.0))[0]
     return times[k] - heights[k] * (times[k + 1] - times[k]) / (heights[k + 1] - heights[k])
-
-
-def heaving_water(half: float, draft: float, depth: float, width: float, h: float = 0.01) -> float:
-    """The mass of water that goes along with a box, ``half`` of which is so wide, that heaves in the middle of a tank,
-    by potential flow on cells of the size h: the surfaces beside the box move as pistons, by as much water as it moves
-    aside."""
-    from scipy.sparse import lil_matrix
-    from scipy.sparse.linalg import spsolve
-
-    columns, rows, under, below = (round(length / h) for length in (0.5 * width, depth, half, depth - draft))
-    numbers = -np.ones((columns, rows), dtype=int)
-    wet = np.ones((columns, rows), dtype=bool)
-    wet[:under, below:] = False
-    numbers[wet] = np.arange(wet.sum())
-    flows, matrix = np.zeros(wet.sum()), lil_matrix((wet.sum(), wet.sum()))
-    for i, j in np.argwhere(wet):
-        k = numbers[i, j]
-        for a, b in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
-            if 0 <= a < columns and 0 <= b < rows and wet[a, b]:
-                matrix[k, k] -= 1.0
-                matrix[k, numbers[a, b]] += 1.0
-            elif b > j:
-                flows[k] = -h * (1.0 if i < under else -half / (0.5 * width - half))
-    wanted = flows.copy()
-    matrix[0], wanted[0] = 0.0, 0.0
-    matrix[0, 0] = 1.0
-    return 2.0 * 1000.0 * float(-(flows * spsolve(matrix.tocsr(), wanted)).sum())

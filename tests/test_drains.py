@@ -1,29 +1,26 @@
 """Drains: what they take is out of everybody's reach and counted to a particle, and sinks take their flow rate; for
 their derivatives, batches and runs that go on see tests/test_features.py."""
 
-import json
-
 import numpy as np
 import pytest
 
-from cortado import Scene, SceneError, Simulation
+from cortado import SceneError, Simulation
 from cortado.cli.run_report import Balance
 from cortado.pictures.film import is_out, shown_places
 from cortado.scene.drain_tables import open_sphere
 from cortado.scene.emitter_table import samples, waits
-from scenes import jet, plane, scene
+from scenes import box, jet, plane, pool, scene
 
 SPACING = 0.025
 HOLE = {"shape": "sink", "name": "hole"}
-OVER = {"shape": "box", "name": "over", "lower": [0.3, 0.36]}
 SOLVER = {"kind": "projection", "time_step": 0.002}
 
 
 def emptied(d, made=None, **keys):
     """A block of fluid beside a wall, or another scene, with a sink off the floor and a box above."""
     sink = {**HOLE, "position": [0.22, 0.02, 0.13][:d], "radius": 0.05, "flow_rate": [0.05, 0.01][d - 2]}
-    box = {**OVER, "lower": [*OVER["lower"], 0.0][:d]}
-    return (made or (plane if d == 2 else scene))(drain=[sink, box], solver=SOLVER, **keys)
+    over = {"shape": "box", "name": "over", "lower": [0.3, 0.36, 0.0][:d]}
+    return (made or (plane if d == 2 else scene))(drain=[sink, over], solver=SOLVER, **keys)
 
 
 def recirculating(**keys):
@@ -34,18 +31,9 @@ def recirculating(**keys):
     return jet(**{"emitter": [*jet().emitter, slot], "drain": [lid], "solver": SOLVER, **keys})
 
 
-def tank(depth=0.5, time_step=1e-3, **keys):
+def tank(depth=0.5, **keys):
     """A tank of one metre in the plane, with water up to a depth."""
-    water = {"shape": "box", "phase": "water", "lower": [0.0, 0.0], "upper": [1.0, depth]}
-    tables = {
-        "dimension": 2,
-        "discretisation": {"spacing": SPACING},
-        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 1e-3}],
-        "fluid": [water],
-        "container": {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, depth + 0.5]},
-        "solver": {"kind": "projection", "time_step": time_step},
-    }
-    return Scene.from_json(json.dumps({**tables, **keys}))
+    return pool([1.0, depth], [1.0, depth + 0.5], SPACING, **keys)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -55,10 +43,9 @@ def test_what_a_box_took_is_out_of_reach_and_what_is_left_goes_on_as_if_it_were_
     coarse correction of the projection every particle of a scene has a share, of (1e-6 spacings / dt)^2."""
     solver = {"kind": kind, "time_step": 0.002}
     solver |= {"minimum_iterations": 4, "maximum_iterations": 4} if kind == "pcisph" else {}
-    blocks = [{"shape": "box", "phase": "water", "lower": [x, 0.3], "upper": [x + 0.2, 0.5]} for x in (0.0, 0.8)]
-    room = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}
-    box = {"shape": "box", "name": "right", "lower": [0.6, 0.0], "upper": [1.0, 0.2]}
-    both = plane(fluid=blocks, container=room, drain=[box], solver=solver)
+    blocks = [box([x, 0.3], [x + 0.2, 0.5], phase="water") for x in (0.0, 0.8)]
+    room = box([0.0, 0.0], [1.0, 1.0])
+    both = plane(fluid=blocks, container=room, drain=[box([0.6, 0.0], [1.0, 0.2], name="right")], solver=solver)
     alone = plane(fluid=blocks[:1], container=room, solver=solver)
     run, other = (Simulation(one, precision=precision).run(150, record_every=10) for one in (both, alone))
     drained, left = run.others["drained"], len(other.positions[0])
@@ -192,11 +179,9 @@ def test_what_drains_took_comes_out_again_in_line_behind_the_layers_before():
         ([{"fed_by": ["lid"]}, {"name": "b", "fed_by": ["lid"]}], "emitter[1].fed_by", "feed no other emitter"),
         ([{"fed_by": ["ld"]}], "emitter[0].fed_by", "of ['lid']"),
         ([{}, {}], "emitter[1].name", "another name"),
-        ([{"name": "a/b"}], "emitter[0].name", 'without "/"'),
         ([{"radius": None}], "emitter[0].radius", "or sides in its place"),
         ([{"sides": [0.1]}], "emitter[0].radius", "left out, as there are sides"),
         ([{"radius": None, "sides": [0.1, 0.1]}], "emitter[0].sides", "a list of 1"),
-        ([{"radius": None, "sides": [2.0]}], "emitter[0].sides", "so small"),
         ([{"flow_rates": [0.1, 0.1]}], "emitter[0].times", "missing"),
     ],
 )
@@ -213,15 +198,13 @@ def test_a_jet_out_of_a_slot_contracts():
     """By 0.611 = pi / (pi + 2), with the speed of a fall to where it is narrowest, half the slot's width below it. The
     slot is in the floor, beside a wall in place of its plane of symmetry."""
     spacing, half, across, depth = 0.01, 0.06, 0.5, 0.6
-    floor = {"shape": "box", "name": "floor", "lower": [half, -0.05], "upper": [across + 0.05, 0.0]}
-    full = tank(
-        discretisation={"spacing": spacing},
-        fluid=[{"shape": "box", "phase": "water", "lower": [0.0, 0.0], "upper": [across, depth]}],
-        container={"shape": "box", "lower": [0.0, -0.4], "upper": [across, depth + 0.2]},
-        solid=[floor],
-        drain=[{"shape": "box", "name": "below", "upper": [across, -0.2]}],
-        solver={"kind": "projection", "time_step": 6.5e-4},
-    )
+    tables = {
+        "solid": [box([half, -0.05], [across + 0.05, 0.0], name="floor")],
+        "solver": {**SOLVER, "time_step": 6.5e-4},
+    }
+    tables["drain"] = [{"shape": "box", "name": "below", "upper": [across, -0.2]}]
+    tables["container"] = box([0.0, -0.4], [across, depth + 0.2])
+    full = pool([across, depth], [across, depth + 0.2], spacing, **tables)
     run = Simulation(full).run(900, record_every=150)
     above = ((run.others["drained"] == 0) & (run.positions[..., 1] > 0.0)).sum(axis=1) * spacing**2
     flow = (above[2] - above[-1]) / (run.times[-1] - run.times[2])
@@ -235,44 +218,33 @@ def test_walls_around_a_sink_are_taken_out_of_its_sphere():
         assert open_sphere(room, np.array(place), 0.1) == pytest.approx(2.0 * np.pi * part, rel=3e-3)
     space = scene().resting_room
     assert open_sphere(space, np.zeros(3), 0.1) == pytest.approx(0.5 * np.pi, rel=1e-2)
-    floor = {"name": "floor", "shape": "box", "lower": [-1.0, -0.06], "upper": [1.0, 0.0]}
-    above = plane(solid=[floor], container={"shape": "none"}).resting_room
+    above = plane(solid=[box([-1.0, -0.06], [1.0, 0.0], name="floor")], container={"shape": "none"}).resting_room
     assert open_sphere(above, np.array([0.5, 0.0]), 0.1) == pytest.approx(np.pi, rel=3e-2), "not what is below a floor"
 
 
 WRONG = [
     ([{**HOLE, "position": [2.0, 0.0], "flow_rate": 0.1}], "drain[0].position", "in the container"),
-    ([{**HOLE, "position": [0.5, 0.0], "flow_rate": -0.1}], "drain[0].flow_rate", "at least 0"),
     ([{**HOLE, "position": [0.5, 0.0]}], "drain[0].flow_rate", "missing"),
     ([{**HOLE, "position": [0.5, 0.0], "times": [0.0, 1.0]}], "drain[0].flow_rates", "missing"),
     ([{**HOLE, "position": [0.5, 0.0], "times": [0.5, 1.0], "flow_rates": [0.1, 0.1]}], "drain[0].times", "from 0 on"),
     ([{**HOLE, "position": [0.5, 0.0], "flow_rate": 0.1, "radius": 0.001}], "drain[0].radius", "one spacing"),
-    ([{**HOLE, "position": [0.5, 0.0], "flow_rate": 0.1, "radius": 50.0}], "drain[0].radius", "so small"),
-    ([{**HOLE, "position": [0.5, 0.0], "flow_rate": 0.1, "name": "a/b"}], "drain[0].name", 'without "/"'),
     ([{"shape": "box", "name": "a", "lower": [0.0, 0.0, 0.0], "upper": [1.0, 1.0]}], "drain[0].lower", "2 components"),
-    ([{"shape": "box", "name": "a", "upper": [0.5, 0.5, 0.5]}], "drain[0].upper", "2 components"),
-    ([{"shape": "box", "name": "a", "lower": [2.0, 0.0]}], "drain[0].lower", "in the container"),
-    ([{"shape": "box", "name": "a", "upper": [-1.0, 0.0]}], "drain[0].upper", "in the container"),
     ([{"shape": "box", "name": "a"}, {"shape": "box", "name": "a"}], "drain[1].name", "another name"),
     ([{"shape": "plane", "name": "a", "position": [0.0, 2.0], "direction": [0.0, 1.0]}], "drain[0].position", "part"),
-    ([{"shape": "plane", "name": "a", "position": [0.0, 0.2], "direction": [0.0, 0.0]}], "drain[0].direction", "zero"),
 ]
 
 
-BLOCK = {"name": "block", "shape": "box", "lower": [0.3, 0.5], "upper": [0.7, 0.9]}
-
-
 def test_a_drain_or_a_column_in_a_solid_is_told_in_a_sentence():
-    room = {"shape": "box", "name": "over", "lower": [0.4, 0.6], "upper": [0.6, 0.8]}
-    tank(solid=[BLOCK], drain=[{**room, "upper": [0.6, 0.95]}])
-    with pytest.raises(
-        SceneError, match=r"drain\[0\] is all of it in solids, but must be where a part of it is outside"
-    ):
-        tank(solid=[BLOCK], drain=[room])
+    block, room = box([0.3, 0.5], [0.7, 0.9], name="block"), box([0.4, 0.6], [0.6, 0.8], name="over")
+    tank(solid=[block], drain=[{**room, "upper": [0.6, 0.95]}])
+    with pytest.raises(SceneError, match=r"drain\[0\] is all of it in solids, but must be where a part of it is out"):
+        tank(solid=[block], drain=[room])
     tap = {"phase": "water", "outlet": [0.2, 0.7], "radius": 0.05, "flow_rate": 0.05, "direction": [-1.0, 0.0]}
-    tank(solid=[BLOCK], emitter=[{**tap, "length": 0.05}])
+    tank(solid=[block], emitter=[{**tap, "length": 0.05}])
+    with pytest.raises(SceneError, match="projection"):
+        tank(drain=[{**HOLE, "position": [0.5, 0.0], "flow_rate": 0.1}], solver={"kind": "pcisph", "time_step": 1e-3})
     with pytest.raises(SceneError, match=r"emitter\[0\] is partly in a solid, for example at"):
-        tank(solid=[BLOCK], emitter=[tap])
+        tank(solid=[block], emitter=[tap])
 
 
 @pytest.mark.parametrize(("drains", "key", "words"), WRONG)
@@ -280,8 +252,3 @@ def test_a_wrong_drain_is_told_in_a_sentence(drains, key, words):
     with pytest.raises(SceneError) as error:
         tank(drain=drains)
     assert str(error.value).startswith(key) and words in str(error.value)
-
-
-def test_a_sink_needs_the_projection():
-    with pytest.raises(SceneError, match="projection"):
-        tank(drain=[{**HOLE, "position": [0.5, 0.0], "flow_rate": 0.1}], solver={"kind": "pcisph", "time_step": 1e-3})

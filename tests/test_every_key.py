@@ -289,9 +289,7 @@ def path(**keys):
 
 REFUSED = {
     "mixture.strength": lambda: two_layers(mixture={"strength": 2.0}),
-    "mixture.interface_width": lambda: two_layers(mixture={"interface_width": 0.1}),
     "mixture.free_energy": lambda: two_layers(mixture={"free_energy": "miscible"}),
-    "mixture.mobility_form": lambda: two_layers(mixture={"mobility_form": "constant"}),
     "forces.viscous_solve": lambda: plane(forces={"viscosity": "pairwise", "viscous_solve": "implicit"}),
     "container.slip": lambda: plane(container={**TANK, "periodic": [True, True], "slip": "no"}),
     "container.colour": lambda: plane(container={**TANK, "periodic": [True, True], "colour": [0.1, 0.2, 0.3]}),
@@ -299,9 +297,6 @@ REFUSED = {
     "phase[0].material": lambda: plane(phase=[{**MUD_PHASE, "material": "milk", "colour": [0.1, 0.2, 0.3]}], **MUD),
     "forces.gravity": lambda: plane(forces={"gravity": [0.0, -1.62]}, schedule=SHAKEN),
     "picture.light": lambda: plane(picture={"light": "noon", "background": [0.5, 0.5, 0.5]}),
-    "picture.floor": lambda: plane(picture={"floor": False}),
-    "picture.field_of_view": lambda: plane(picture={"field_of_view": 40.0}),
-    "picture.surface": lambda: plane(picture={"surface": "spheres"}),
     "picture.transparency": lambda: scene(picture={"surface": "spheres", "transparency": 0.5}),
     "picture.film_speed": lambda: plane(picture={"film_frames": 0, "film_speed": 0.5}),
     "picture.camera": lambda: scene(picture={"camera": [1.0, 1.0, 1.0], "camera_path": KEYFRAMES}),

@@ -51,7 +51,6 @@ DRAWN = MISTAKES.keys() - {"first_gradient.py", "custom_loss.py"}
 
 
 def source_of(name: str) -> str:
-    """Of an example, or of its short run."""
     source = (FOLDER / name).read_text()
     long, short = SHORTER.get(name, ("", ""))
     assert long in source
@@ -99,15 +98,14 @@ def cells(name):
     return json.loads(BOOKS[name].read_text(encoding="utf-8"))["cells"]
 
 
-@pytest.mark.parametrize("name", BOOKS)
-def test_a_notebook_is_kept_without_outputs(name):
-    code = [cell for cell in cells(name) if cell["cell_type"] == "code"]
-    assert code and not any(cell["outputs"] or cell["execution_count"] for cell in code)
+def test_notebooks_are_kept_without_outputs():
+    for name in BOOKS:
+        code = [cell for cell in cells(name) if cell["cell_type"] == "code"]
+        assert code and not any(cell["outputs"] or cell["execution_count"] for cell in code), name
 
 
 @pytest.mark.parametrize("name", BOOKS)
 def test_all_cells_run(name, monkeypatch, tmp_path):
-    """One behind the other, without a kernel."""
     if name == "train_a_policy":
         pytest.importorskip("optax", reason="optax is not installed")
     monkeypatch.setenv("CORTADO_QUICK", "1")
@@ -140,7 +138,6 @@ COMMANDS = re.findall(r"^    cortado (.*)$", README, re.MULTILINE)
 
 @pytest.fixture(autouse=True)
 def root(monkeypatch):
-    """The working directory that the README assumes."""
     monkeypatch.chdir(ROOT)
 
 
@@ -213,7 +210,6 @@ def test_no_new_scene_is_warned_of(tmp_path, template, dimension):
 
 @pytest.mark.parametrize("path", TASKS, ids=lambda path: path.stem)
 def test_no_search_is_warned_of(path):
-    """At its start and at its target."""
     task = load_task(path)
     tilt = Tilt(task.scene.forces.gravity)
     start = {name: value for name, value in task.start.items() if not isinstance(value, str)}

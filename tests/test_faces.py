@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from cortado import Problem, Simulation
-from cortado.losses import CentreOfMass
 from cortado.sensors import SolidLoad, WallForce
 from reference_projection import Projection
 from scenes import Squares, box, pool, simulated
@@ -142,11 +141,3 @@ def test_derivatives_by_what_the_solid_does(name, quantity):
     simulation = simulated(scene)
     weights = np.random.default_rng(1).uniform(size=simulation.quantity(quantity).shape)
     check(Problem(simulation, STEPS, Squares({quantity: weights})), *point_of(scene))
-
-
-def test_in_float32_the_gradient_is_near_that_of_float64():
-    given = {"gravity": [0.5, -9.81], "viscosity": 1.0, "flap.position": [-0.25, 0.3]}
-    made = (simulated(flume(), precision) for precision in ("float32", "float64"))
-    single, double = (Problem(one, 12, CentreOfMass([0.5, 0.3])).value_and_gradient(given)[1] for one in made)
-    for name, wanted in double.items():
-        assert np.linalg.norm(single[name] - wanted) < 1e-2 * np.linalg.norm(wanted), name

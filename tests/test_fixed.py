@@ -52,55 +52,40 @@ def test_what_an_object_was_made_with_cannot_be_set_or_deleted(made, name):
         one.gravity = np.zeros(2)
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - {"Recorded"}))
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
-def test_an_object_that_is_copied_does_not_change_either(made, name, again):
-    twin, attribute = again(made[name]), next(a for a in vars(made[name]) if not a.startswith("_"))
-    with pytest.raises(InputError, match="cannot be set"):
-        setattr(twin, attribute, None)
+def test_an_object_that_is_copied_does_not_change_either(made, again):
+    for name in set(NAMES) - {"Recorded"}:
+        twin, attribute = again(made[name]), next(a for a in vars(made[name]) if not a.startswith("_"))
+        with pytest.raises(InputError, match="cannot be set"):
+            setattr(twin, attribute, None)
 
 
 def test_a_class_of_ones_own_keeps_its_own_attributes():
-    class Counting(losses.CentreOfMass):
-        def __init__(self, target):
-            super().__init__(target)
-            self.calls = 0
-
+    class Keeping(losses.CentreOfMass):
         def value(self, end):
-            self.calls += 1
             self.last = end
             return super().value(end)
 
-    loss = Counting([0.0, 0.0])
+    loss = Keeping([0.0, 0.0])
     Problem(Simulation(plane()), 1, loss).value({})
-    assert loss.calls == 1 and loss.last is not None
+    assert loss.last is not None
     with pytest.raises(InputError, match="target cannot be set"):
         loss.target = np.ones(2)
 
 
-def test_an_object_may_have_a_method_of_its_own(simulation):
-    loss = losses.FinalPositions(simulation.positions)
-    loss.value = lambda end: 5.0
-    assert loss.value(None) == 5.0
+def test_first_particles_and_walls_cannot_be_written(simulation):
+    for name in ("positions", "velocities", "mass_fractions", "walls"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(simulation, name)[0] = 0.0
 
 
-@pytest.mark.parametrize("name", ["positions", "velocities", "mass_fractions", "walls"])
-def test_first_particles_and_walls_cannot_be_written(simulation, name):
-    with pytest.raises(ValueError, match="read-only"):
-        getattr(simulation, name)[0] = 0.0
-
-
-# ---- what is given -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("make", "name"),
     [
         (lambda table: gradients.EnsembleMean(table), "spread"),
-        (lambda table: gradients.RandomizedSmoothing(spread=table), "spread"),
         (lambda table: gradients.Guided(spread=table), "spread"),
         (optimisers.Adam, "learning_rate"),
-        (optimisers.GradientDescent, "learning_rate"),
         (lambda table: optimisers.LBFGS(scale=table), "scale"),
-        (lambda table: optimisers.LineSearch(scale=table), "scale"),
     ],
 )
 def test_a_table_of_settings_is_copied(make, name):

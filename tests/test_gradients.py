@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 from cortado import Problem, Simulation, losses
 from finite_differences import both_modes, central_difference, decades, distance, plateau
@@ -35,17 +34,12 @@ def disturbed(positions):
 
 ITERATIONS = {"fixed": {}, "tolerance": {"minimum_iterations": 2, "maximum_iterations": 40, "density_tolerance": 0.001}}
 
-WHAT = ("gravity", "gravity over time", "initial_positions", "initial_velocities", "viscosity")
-FIXED, TOLERANCE = ITERATIONS
-LONG = zip(WHAT, (FIXED, TOLERANCE, FIXED, TOLERANCE, FIXED), strict=True)
-"""Of 200 steps, each in one way to iterate, as those of 100 steps come in both."""
-
 
 @pytest.mark.parametrize(
     ("what", "steps", "iterations"),
     [
-        *((what, 100, iterations) for what in WHAT for iterations in ITERATIONS),
-        *((what, 200, iterations) for what, iterations in LONG),
+        *((what, 100, iterations) for what in SCALES for iterations in ITERATIONS),
+        *((what, 200, iterations) for what, iterations in zip(SCALES, 3 * list(ITERATIONS), strict=False)),
     ],
 )
 def test_splash(what, steps, iterations):
@@ -70,27 +64,6 @@ def test_a_fluid_without_viscosity_has_gradients_by_pairs():
     directions = {"initial_positions": 0.05 * np.random.default_rng(1).standard_normal((64, 2)) / 8.0}
     _, tangent = both_modes(problem, point, directions)
     assert distance(problem.value, point, directions, tangent, decades(2.0, 11.0, apart=0.25), enough=1e-6) < 1e-6
-
-
-def test_a_function_of_warp_arrays_is_a_loss():
-    simulation = Simulation(splash(), precision="float64")
-    recorded = Problem(simulation, 20, mean_square)
-    written = Problem(simulation, 20, losses.FinalPositions(np.zeros_like(simulation.positions)))
-    point = {"gravity": np.array([0.0, -9.81, 0.0])}
-    (loss, gradient), (wanted, exact) = recorded.value_and_gradient(point), written.value_and_gradient(point)
-    assert loss == pytest.approx(wanted, rel=1e-13)
-    np.testing.assert_allclose(gradient["gravity"], exact["gravity"], rtol=1e-12)
-
-
-@wp.kernel
-def add_square(x: wp.array(dtype=wp.vec3d), count: wp.float64, loss: wp.array(dtype=wp.float64)):
-    i = wp.tid()
-    wp.atomic_add(loss, 0, wp.dot(x[i], x[i]) / count)
-
-
-def mean_square(positions, velocities, loss):
-    count = len(positions)
-    wp.launch(add_square, count, inputs=[positions, float(count)], outputs=[loss], device=positions.device)
 
 
 POINT, ALONG = {"x": np.array(1.0), "y": np.array(5.0)}, {"x": np.array(1.0)}

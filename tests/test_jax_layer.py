@@ -37,7 +37,6 @@ def point(jax, simulation):
     return tuple(jax.numpy.asarray(value) for value in values)
 
 
-# ---- derivatives -------------------------------------------------------------------------------------------------
 def test_compiled_scanned_and_recomputed_segments_have_the_same_gradient(jax, layer, simulation, point):
     first = {**layer.state(simulation), "velocities": point[1]}
 
@@ -91,7 +90,6 @@ def test_steps_go_back_by_an_estimator_one_by_one_and_mapped(jax, layer, simulat
 
 
 def test_residuals_that_are_gone_are_computed_again(jax, layer, simulation, point, monkeypatch):
-    """And none is left behind by a backward pass."""
     from cortado.optimisation.layers import with_jax
 
     first = layer.state(simulation)
@@ -116,7 +114,6 @@ def test_a_gradient_is_taken_twice_from_one_forward_run(jax, problem, layer):
     assert back(1.0) == back(1.0) != 0.0
 
 
-# ---- maps --------------------------------------------------------------------------------------------------------
 GONE = np.array([[0.4, -9.0], [9e5, 0.0], [-1.0, -8.0]])
 """Gravities, the second of which throws the fluid through the wall."""
 
@@ -188,39 +185,12 @@ def test_lost_evaluations_of_a_map_that_goes_one_by_one_leave_the_others(jax, la
     assert np.isfinite(along).all() and along[kept].all() and not along[1].any()
 
 
-def test_a_map_of_a_map_has_the_bits_of_single_evaluations(jax, layer, problem):
-    gravities = jax.numpy.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
-    nested = jax.vmap(jax.vmap(lambda g: layer.value(problem)({"gravity": g, "viscosity": 9.0})))(gravities[None])
-    assert nested.shape == (1, 3) and nested[0, 1] == layer.value(problem)({"gravity": gravities[1], "viscosity": 9.0})
-
-
 def test_constant_rows_of_a_map_are_no_rows_of_steps(jax, layer, simulation):
-    """There are as many maps as steps."""
     gravities = np.array([[0.4, -9.0], [0.0, -9.81], [-1.0, -8.0]])
     first = layer.state(simulation)
     found = jax.vmap(lambda g: layer.step(simulation, first, {"gravity": g}, steps=3)["velocities"])(gravities)
     wanted = [simulation.run(3, {"gravity": gravity}).last_state["velocities"] for gravity in gravities]
     np.testing.assert_array_equal(found, wanted)
-
-
-# ---- searches, threads, what is looked at ------------------------------------------------------------------------
-def test_a_descent_finds_the_gravity_that_made_a_target(jax, layer, simulation):
-    """As optimisers of other libraries do: a compiled step of a loss and its gradient, again and again."""
-    target = simulation.run(20, {"gravity": [1.0, -9.0]}).positions[-1]
-    loss = layer.value(cortado.Problem(simulation, 20, cortado.losses.FinalPositions(target)))
-
-    @jax.jit
-    def descend(parameters):
-        value, gradient = jax.value_and_grad(loss)(parameters)
-        return value, {name: parameters[name] - 8e5 * gradient[name] for name in parameters}
-
-    parameters = {"gravity": jax.numpy.array([0.0, -9.81])}
-    losses = []
-    for _ in range(20):
-        value, parameters = descend(parameters)
-        losses.append(float(value))
-    np.testing.assert_allclose(parameters["gravity"], [1.0, -9.0], atol=0.05)
-    assert losses[-1] < 1e-2 * losses[0]
 
 
 def test_optax_and_optimistix_search(jax, layer, simulation):
@@ -239,9 +209,7 @@ def test_optax_and_optimistix_search(jax, layer, simulation):
     assert loss(found.value) < 1e-3 * loss(start)
 
 
-@pytest.mark.parametrize(
-    "what", ["density", "pressure", "vorticity", "wall_force", sensors.PressureProbe([0.2, 0.1])], ids=str
-)
+@pytest.mark.parametrize("what", ["density", "wall_force", sensors.PressureProbe([0.2, 0.1])], ids=str)
 def test_what_is_measured_has_the_derivatives_of_differences(jax, layer, simulation, what):
     from jax.test_util import check_grads
 
@@ -261,7 +229,6 @@ def test_what_is_measured_has_the_derivatives_of_differences(jax, layer, simulat
 
 
 def test_readings_are_gone_back_through_in_any_order(jax, layer):
-    """With the clock and the schedule of each."""
     simulation = Simulation(scheduled(), precision="float64")
     early, late = (layer.state(simulation, simulation.run(steps).last_state) for steps in (5, 22))
     reading = layer.measure(simulation, "pressure")
@@ -300,7 +267,6 @@ def test_a_picture_has_the_derivatives_of_differences_in_reverse_mode(jax, layer
         jax.jvp(draw, arguments, arguments)
 
 
-# ---- bad uses ----------------------------------------------------------------------------------------------------
 BAD_STATES = {
     **layered.BAD_STATES,
     "float32": (lambda s: {**s, "positions": s["positions"].astype("float32")}, "state positions is float32, but"),
@@ -325,14 +291,11 @@ def test_bad_parameters_are_refused_in_a_sentence(layer, simulation, problem, na
 
 @dataclass
 class Changing(gradients.AdjointEstimator):
-    """An estimator whose settings may change."""
-
     def derivative(self, rollout):
         return gradients.Exact().derivative(rollout)
 
 
 def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, problem):
-    """Those of tests/test_bad_uses.py aside."""
     state = layer.state(simulation)
     other = layer.state(Simulation(plane(discretisation={"spacing": 0.04}), precision="float64"))
     gentle = gradients.RandomizedSmoothing(samples=4)
@@ -341,23 +304,15 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         {**state, "velocities": np.asarray(state["velocities"]).astype(one)} for one in ("float16", jax.numpy.bfloat16)
     )
     for use, words in [
-        (lambda: layer.step(simulation, half), "state velocities is float16, but must be float32 or float64, as half"),
         (lambda: layer.step(simulation, brain), "state velocities is bfloat16, but must be float32 or float64, as"),
         (lambda: layer.measure(simulation, "density")(half), "state velocities is float16, but must be float32 or"),
-        (lambda: layer.restart_state(simulation, half), "state velocities is float16, but must be float32 or float64"),
         (lambda: layer.step(simulation, state, {"gravity": rounded}), "parameter gravity is float16, but must be"),
         (lambda: layer.step(simulation, other), "state positions has shape"),
-        (lambda: layer.restart_state(simulation, other), "state positions has shape"),
-        (lambda: layer.step(simulation, state, steps=0), "steps is 0, but must be a whole number of at least 1"),
         (lambda: layer.step(simulation, state, {"viscosity": single}), "parameter viscosity is float32, but must be"),
         (lambda: layer.rollout(simulation, state, steps=5, record_every=2), "record_every is 2, but must divide the 5"),
         (lambda: layer.step(simulation, state, gradient=gentle), "estimator is .*, but must be an AdjointEstimator"),
         (lambda: layer.step(simulation, state, gradient=Changing()), "estimator has an unhashable type: 'Changing'"),
-        (
-            lambda: layer.value(problem, gentle)({}, state),
-            "gradient is a RandomizedSmoothing, but must be an AdjointEstimator",
-        ),
-        (lambda: layer.measure(simulation, "colour"), "quantity is 'colour', but must be one of density"),
+        (lambda: layer.value(problem, gentle)({}, state), "gradient is a RandomizedSmoothing, but must be an Adj"),
         (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),
         (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be a renderer, such as"),
     ]:

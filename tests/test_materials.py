@@ -11,31 +11,22 @@ from cortado.pictures.painter import colours_of, painter
 from cortado.pictures.stage import TINT, media_of
 from cortado.pictures.tracing.liquid_surface import liquid_surface
 from cortado.pictures.tracing.near_particles import Particles
-from cortado.pictures.tracing.space import State, environment_of, particles_of
+from cortado.pictures.tracing.space import State, environment_of
 from cortado.scene.appearance import FINISHES, LIQUIDS
-from scenes import box
+from scenes import bodies, box
 
 DARK = (0.06, 0.06, 0.06)
 FRONT = {"camera": [0.03, 0.03, 0.5], "look_at": [0.03, 0.03, 0.01], "field_of_view": 12.0}
 
 
 def scene_of(*materials, depth=0.02, picture=None, container=None, **tables):
-    """A tank with fluid that is so deep [m] in the direction of the view, or several side by side."""
-    count = len(materials)
-    water = {"rest_density": 1000.0, "viscosity": 0.01}
-    phases = [{**water, "name": f"p{k}", "material": name} for k, name in enumerate(materials)]
+    count, own = len(materials), {"rest_density": 1000.0, "viscosity": 0.01}
+    tables["phase"] = [{**own, "name": f"p{k}", "material": name} for k, name in enumerate(materials)]
     ends = [(0.06 * k / count, 0.06 * (k + 1) / count) for k in range(count)]
-    bodies = [box([x, 0.0, 0.0], [to, 0.06, depth], phase=f"p{k}") for k, (x, to) in enumerate(ends)]
-    given = {
-        "dimension": 3,
-        "discretisation": {"spacing": 0.01},
-        "phase": phases,
-        "fluid": bodies,
-        "container": {**box([0.0] * 3, [0.06, 0.12, depth]), **(container or {})},
-        "solver": {"kind": "pcisph", "time_step": 0.001},
-        "picture": {"width": 64, "height": 64, "floor": False, "background": DARK, **FRONT, **(picture or {})},
-    }
-    return cortado.Scene(**{**given, **tables})
+    fluid = [box([x, 0.0, 0.0], [to, 0.06, depth], phase=f"p{k}") for k, (x, to) in enumerate(ends)]
+    room = {**box([0.0] * 3, [0.06, 0.12, depth]), **(container or {})}
+    tables["picture"] = {"width": 64, "height": 64, "floor": False, "background": DARK, **FRONT, **(picture or {})}
+    return bodies(3, fluid, room, 0.01, **tables)
 
 
 def drawn(scene, shown=True):
@@ -78,16 +69,6 @@ def test_water_beside_a_thin_wall_is_no_milk():
     assert scattering[left].max() < 10.0 and scattering[~left].min() > 100.0
 
 
-def test_particles_have_the_media_of_what_they_are_made_of():
-    scene = scene_of("milk", "oil")
-    stage = painter(scene, np.full((1, 3), 0.01)).stage
-    fractions = np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5]])
-    launch = BandLauncher(wp.get_device("cpu"))
-    found = particles_of(stage, np.zeros((3, 3)), np.zeros((3, 3)), launch, fractions).looks.numpy()
-    own = [[LIQUIDS[name].scattering, LIQUIDS[name].absorption] for name in ("milk", "oil")]
-    np.testing.assert_allclose(found[:, 3:], [*own, np.mean(own, axis=0)], rtol=1e-6)
-
-
 def test_what_a_picture_says_wins_over_materials():
     water = [LIQUIDS["water"].scattering, LIQUIDS["water"].absorption]
     media, through = media_of(scene_of("water"), 1.0)
@@ -107,13 +88,6 @@ def test_a_colour_that_is_given_wins_and_another_material_has_another():
     red = scene.replaced("phase.p0.colour=[0.8,0.1,0.1]").replaced("phase.p0.material=oil")
     assert red.phase[0].colour == (0.8, 0.1, 0.1) and red.phase[0].material == "oil"
     assert cortado.Scene.from_json(scene.to_json()) == scene
-
-
-def test_a_material_is_of_pictures_only():
-    plain, named = scene_of(None), scene_of("water")
-    blue = plain.phase[0].colour
-    assert named.replaced(f"phase.p0.colour={list(blue)}").computed_json() == plain.computed_json()
-    assert scene_of(None, container={"material": "steel"}).computed_json() == plain.computed_json()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from bad_scenes import plane
@@ -53,17 +52,12 @@ def test_the_estimate_is_what_a_run_and_its_gradient_take(precision):
 
 @pytest.fixture
 def scarce(monkeypatch) -> Callable[[float], None]:
-    """Sets what is free [bytes]."""
     return lambda free: monkeypatch.setattr(threads, "available", lambda device=None: free)
 
 
 def problem() -> Problem:
     simulation = Simulation(scene_from_dict(plane()))
     return Problem(simulation, 2, losses.FinalPositions(simulation.positions))
-
-
-def gradient(one: Problem) -> None:
-    one.value_and_gradient({"gravity": np.array(one.simulation.scene.forces.gravity)})
 
 
 def test_a_scene_is_refused_before_it_is_cut_into_particles(scarce):
@@ -79,10 +73,9 @@ def test_a_scene_is_refused_before_it_is_cut_into_particles(scarce):
         (lambda one: Simulation(one.simulation.scene), "50 particles of fluid.* larger spacing"),
         (lambda one: one.simulation.rollout(1000), "1e\\+03 steps.* take fewer steps"),
         (lambda one: one.simulation.run(2), "frames.* larger record_every"),
-        (gradient, "the gradient of 50 particles"),
+        (lambda one: one.value_and_gradient({"gravity": [0.0, -9.81]}), "the gradient of 50 particles"),
         (lambda one: scene_renderer(one.simulation), "nodes.* larger cell"),
     ],
-    ids=["simulation", "steps", "frames", "gradient", "picture"],
 )
 def test_what_does_not_fit_is_refused_in_a_sentence(scarce, work, words):
     one = problem()
@@ -104,12 +97,3 @@ def test_the_limit_of_a_process_and_of_a_container_counts(monkeypatch, tmp_path)
     assert threads.available() == 1900.0
     (tmp_path / "memory.max").write_text("max")
     assert threads.available() > 1e6
-
-
-def test_checkpoints_leave_room_and_no_machine_has_it_for_all_steps(scarce):
-    one = problem().simulation
-    assert one.rollout(100)._interval == 1
-    scarce(50_000)
-    assert one.rollout(100)._interval > 1
-    with pytest.raises(InputError, match="what is kept of 1e\\+11 steps"):
-        problem().simulation.rollout(100_000_000_000)

@@ -16,7 +16,6 @@ import cortado
 from bad_scenes import one_sentence
 from compiling_notice import SAME_KERNELS
 from cortado import ComputationError, InputError, Scene, SceneError, Simulation, load_scene, reference
-from cortado.scene.packages import guarded
 from own_forces import Breeze
 from packages import install, on_path
 from scenes import aimed
@@ -104,13 +103,6 @@ def test_a_task_searches_for_a_parameter_of_one(file, tmp_path, cortado_command)
     assert abs(found - 5.0) < 0.05 and "drag.k" in words
 
 
-def test_the_solver_of_a_package_is_reported(file, tmp_path, cortado_command):
-    out = tmp_path / "out"
-    code, _, told = cortado_command("run", file(THEIRS), "--steps", 4, "--out", out, "--no-pictures")
-    assert code == 0 and (out / "figures" / "density_errors.png").exists(), told
-    assert Scene.from_json((out / "scene.json").read_text()).force[0].kind == "breeze"
-
-
 def test_a_key_of_one_is_swept(file, tmp_path, cortado_command):
     sweep = ("sweep", file(DRAG), "--set", "force.drag.k=1.0,4.0", "--steps", 2, "--out", tmp_path / "runs")
     code, _, told = cortado_command(*sweep)
@@ -160,26 +152,20 @@ def named(kind, *lines):
     [
         (named("drg"), r"force\[0\].kind is .drg., but must be a name that an installed package registers "),
         (solver('kind = "dfsph"'), 'must be "projection" or "pcisph", or a name .*"falling", "remembering"'),
-        (solver("rate = 0.1"), r"solver.rate is not a key of \[solver\]; its keys are kind, time_step, courant"),
         (solver('kind = "remembering"', "minimum_iterations = 2"), r"solver.minimum_iterations is not a key .* rate\."),
         (THEIRS.replace("0.0021", "-1.0"), r"solver.time_step is -1.0, but must be greater than"),
         (force("k = 1.0"), r"force\[0\].kind is missing, but must be a text"),
-        (force("kind = 3"), r"force\[0\].kind is 3, but must be a text"),
         ("force = 3\n" + OURS, r"force is 3, but must be a list of at least one table, each written \[\[force\]\]"),
         (named("gravity"), r"force\[0\].kind is 'gravity', but must be another name, as gravity is a force"),
         (named("drag", "q = 1"), r"force\[0\].q is not a key of \[force\[0\]\]; its keys are kind, k, name"),
         (named("drag", "k = -1.0"), r"force\[0\].k is -1.0, but must be at least 0 1/s"),
-        (named("drag", 'k = "a"'), r"force\[0\].k is 'a', but must be at least 0 1/s"),
-        (named("drag", "k = nan"), r"force\[0\].k is nan, but must be"),
         (named("settings"), r"force\[0\].count is missing, but must be a whole number"),
         (named("settings", "count = 1.5"), r"force\[0\].count is 1.5, but must be a whole number"),
         (named("settings", "count = 1", "way = 1"), r"force\[0\].way is 1, but must be true or false"),
-        (named("settings", "count = 1", "most = -1"), r"force\[0\].most is -1, but must be at least 0"),
         (named("settings", "count = 1", "most = 0"), r'force\[0\] of the kind "settings" cannot be made: most'),
         (named("settings", "count = 1", "most = 13.0"), r'"settings" cannot be made: ZeroDivisionError:'),
         (named("clashing"), r"force\[0\].kind clashing has an argument kind, which is a key of every such"),
         (named("number"), r"is made by toy_parts:MakeFalling, but that returned <.*must .* method force"),
-        (named("nothing"), r"the package toy registers toy_parts:nothing, but that is None, and must be"),
         (named("lost"), r"force\[0\].kind is 'lost', for which the package toy registers toy_parts:lost, but"),
         (named("broken"), r"cannot be imported: ModuleNotFoundError: No module named 'a_module_that_there_is"),
     ],
@@ -192,12 +178,12 @@ def test_what_does_not_fit_is_a_sentence(file, text, said):
         load_scene(path)
 
 
-@pytest.mark.parametrize("ends", [False, True])
 @pytest.mark.parametrize(
     ("at", "code"),
     [("__init__", 2), ("parameters", 2), ("value", 2), ("force", 2), ("shares", 1), ("accelerate", 1), ("build", 2)],
 )
-def test_a_part_that_fails_in_use_is_a_sentence_and_no_success(file, tmp_path, cortado_command, at, code, ends):
+def test_a_part_that_fails_in_use_is_a_sentence_and_no_success(file, tmp_path, cortado_command, at, code):
+    ends = at in ("parameters", "accelerate")
     keys = f'at = "{at}"', f"ends = {str(ends).lower()}"
     made = file(solver('kind = "failing"', *keys) if at == "build" else named("failing", *keys))
     found, _, told = cortado_command("run", made, "--steps", 2, "--out", tmp_path / "out", "--no-pictures")
@@ -217,11 +203,6 @@ def test_a_part_that_fails_in_a_derivative_is_a_sentence(file, mode):
     judged = aimed(Simulation(file(named("failing", f'at = "{mode}"')), precision="float64"), 6)
     with pytest.raises(ComputationError, match=rf'"failing" fails in {mode} of Acting: RuntimeError: toys break'):
         judged.tangent({}, {"gravity": [0.0, 1.0]}) if mode == "tangent" else judged.value_and_gradient({})
-
-
-def test_an_interruption_within_a_part_is_one():
-    with pytest.raises(KeyboardInterrupt), guarded("it fails:", "a package"):
-        raise KeyboardInterrupt
 
 
 def test_two_packages_of_one_name_are_told(file, tmp_path):

@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 import cortado
-from cortado import Problem, Simulation, gradients, losses
+from cortado import Problem, Simulation, losses
 from module_graph import all_before, loaded_before, sources
 from scenes import plane, plane_of_three
 
@@ -39,7 +39,6 @@ records, where some are gone."""
 
 
 def by_import(name):
-    """With the longest part of a dotted name that is a module's."""
     parts = name.split(".")
     for end in range(len(parts), 0, -1):
         module = ".".join(parts[:end])
@@ -93,23 +92,12 @@ def test_what_documents_name_is_there_as_an_attribute_and_to_import(monkeypatch)
         assert reduce(getattr, name.split(".")[1:], cortado) == found, name
 
 
-def test_the_renderer_of_the_documents_is_there():
-    """Also its views and cameras."""
-    names = {"Renderer", "TopView", "Volume", "Orthographic", "Perspective"}
-    text = (ROOT / "docs" / "rendering.md").read_text(encoding="utf-8")
-    assert all(f"`{name}`" in text and isinstance(getattr(cortado.render, name), type) for name in names)
-
-
 def test_types_are_checked_where_cortado_is_used(tmp_path):
     """As the package says that it has types, and its names are found though they are imported late. What the check of
     all types has kept (`python -m tasks types`) spares the time that NumPy's take."""
-    (tmp_path / "use.py").write_text(
-        "import cortado\n"
-        'trajectory = cortado.Simulation("scene.toml").run(3)\n'
-        "reveal_type(trajectory[-1])\n"
-        "reveal_type(trajectory[1:])\n"
-        "cortado.Simulation(3)\n"
-    )
+    lines = ["import cortado", 'trajectory = cortado.Simulation("scene.toml").run(3)', "reveal_type(trajectory[-1])"]
+    lines += ["reveal_type(trajectory[1:])", "cortado.Simulation(3)"]
+    (tmp_path / "use.py").write_text("\n".join(lines))
     if (ROOT / ".mypy_cache").is_dir():
         shutil.copytree(ROOT / ".mypy_cache", tmp_path / ".mypy_cache")
     command = [sys.executable, "-m", "mypy", f"--config-file={ROOT / 'pyproject.toml'}", "use.py"]
@@ -168,18 +156,12 @@ def test_what_a_run_leaves(trajectory, problem):
     assert restart.startswith(f"RestartState(fields={{{names}array (64,)}}, clock=Clock(steps=4, time=0.0084")
 
 
-def test_what_a_search_finds(result):
+def test_what_a_search_finds(result, problem):
     words = r"Result\(gravity \(2,\), viscosity: loss [\d.e-]+ after 3 evaluations; Adam made all its 2 updates\)"
     assert re.fullmatch(words, repr(result))
-    assert re.fullmatch(r"Record\(iteration 0: loss [\d.e-]+, gradient norm [\d.e-]+\)", repr(result.history[0]))
-
-
-def test_what_an_estimator_says(problem):
-    at = {"gravity": np.array([0.0, -9.0]), "viscosity": 0.05}
-    exact = repr(problem.estimate(at))
+    exact = repr(problem.estimate({"gravity": [0.0, -9.0], "viscosity": 0.05}))
     assert re.fullmatch(r"Estimate\(loss [\d.e-]+, gradient of gravity \(2,\), viscosity\)", exact)
-    smoothed = repr(problem.estimate({"gravity": at["gravity"]}, gradients.RandomizedSmoothing({"gravity": 0.1}, 2)))
-    assert smoothed.endswith(", gradient of gravity (2,), with its standard error)")
+    assert re.fullmatch(r"Record\(iteration 0: loss [\d.e-]+, gradient norm [\d.e-]+\)", repr(result.history[0]))
 
 
 def test_a_certificate_is_a_table_and_the_same_text_in_a_notebook(certificate, monkeypatch):
@@ -200,7 +182,6 @@ def pictures(html: str) -> list[np.ndarray]:
 
 
 def cells(html: str) -> list[list[str]]:
-    """The rows of the table in a page, below its head."""
     rows = re.findall("<tr>(.*?)</tr>", html)[1:]
     return [[unescape(cell) for cell in re.findall("<td[^>]*>(.*?)</td>", row)] for row in rows]
 
@@ -225,17 +206,6 @@ def test_a_notebook_shows_what_a_search_found(result, problem, simulation):
     assert (name, unit, first, other_unit) == ("gravity", "m/s²", "0, -9", "Pa s")
     assert found == ", ".join(f"{g:.4g}" for g in result.parameters["gravity"]) and float(number) > 0.0
     assert problem.value({}) == before and pickle.loads(pickle.dumps(result)).problem is None
-
-
-def test_a_search_of_images_shows_images(simulation):
-    renderer = simulation.renderer(resolution=(30, 20))
-    loss = losses.Image(renderer, np.ones(renderer.shape))
-    problem = Problem(simulation, 3, losses.Frames({1: loss, 3: loss}))
-    start = {"initial_positions": simulation.positions}
-    html = cortado.optimise(problem, start, "adam", learning_rate=1e-3, iterations=1)._repr_html_()
-    assert len(pictures(html)) == 2
-    ((name, unit, first, _),) = cells(html)
-    assert (name, unit) == ("initial positions", "m") and first.startswith("(64, 2) numbers, ")
 
 
 def test_a_search_of_a_function_shows_its_losses(monkeypatch):
@@ -263,9 +233,3 @@ def test_a_notebook_plays_a_trajectory_and_nothing_of_none(trajectory):
     assert len(data["times"]) == len(trajectory) and data["particles"] == 64
     assert data["radius"] == pytest.approx(0.56 * 0.05, rel=0.3)
     assert trajectory[:0]._repr_html_() == "<pre>Trajectory(0 frames of 64 particles)</pre>"
-
-
-def test_no_repr_is_long(simulation, trajectory, problem, result, certificate):
-    """Whatever the number of particles, parameters and steps."""
-    shown = [simulation, trajectory, trajectory[0], problem, result, result.history[0], certificate, problem.end({})]
-    assert all(len(repr(one)) < 200 and "\n" not in repr(one) and "[" not in repr(one) for one in shown)

@@ -36,18 +36,6 @@ def test_wheels_are_for_the_pythons_that_are_promised():
     assert PROJECT["project"]["requires-python"] == ENGINE["project"]["requires-python"] == ">=3.11"
 
 
-def test_only_an_editable_install_is_for_its_own_processor():
-    build = ENGINE["tool"]["scikit-build"]
-    assert build["cmake"]["define"]["CORTADO_NATIVE"] == "OFF"
-    states = [one["if"] for one in build["overrides"] if "CORTADO_NATIVE" in one.get("cmake", {}).get("define", {})]
-    assert states == [{"state": "editable"}]
-
-
-def test_the_examples_go_into_the_wheel():
-    wheel = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
-    assert wheel == {"packages": ["src/cortado"], "force-include": {"examples": "cortado/examples"}}
-
-
 def test_what_was_tested_is_pinned():
     lines = (ROOT / "requirements-tested.txt").read_text("utf-8").splitlines()
     pinned = {re.sub("[-_.]+", "-", line.partition("==")[0]).lower() for line in lines if "==" in line}
@@ -68,26 +56,11 @@ ALL = ["mypy", "pytest", "ruff", "ruff"]
 
 @pytest.mark.parametrize(("fails", "wanted"), [("format", ALL[2:]), ("mypy", ALL), ("pytest", ALL)])
 def test_a_task_ends_with_the_first_failure(monkeypatch, fails, wanted):
-    """Types are looked at beside the tests."""
     ran = []
     monkeypatch.setattr(tasks, "set_up", lambda extra: None)
     monkeypatch.setattr(tasks, "run", lambda command: ran.append(command[0]) or (3 if fails in command else 0))
     assert tasks.main(["test"]) == 3 and sorted(ran) == wanted
     assert tasks.main(["lint", "--fix"]) == 0
-
-
-def test_the_site_is_made_after_what_it_needs_is_installed(monkeypatch, capsys):
-    done = []
-    monkeypatch.setattr(tasks, "set_up", done.append)
-    monkeypatch.setattr(tasks, "run", lambda command: done.append(command[0]) or 0)
-    assert tasks.main(["docs"]) == 0 and done == ["test", "docs", "sphinx-build"]
-    assert capsys.readouterr().out == "build/docs/index.html\n"
-
-
-@pytest.mark.parametrize("arguments", [[], ["walk"]])
-def test_an_unknown_task_is_told(arguments):
-    done = subprocess.run([sys.executable, "-m", "tasks", *arguments], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (2, "") and "one of: setup, test, test-all, demo, lint" in done.stderr
 
 
 @pytest.fixture
@@ -107,18 +80,6 @@ def installs(tmp_path, monkeypatch):
 INSTALLED = ["pyproject.toml", "reference/pyproject.toml", "reference/cpp/CMakeLists.txt"]
 
 
-@pytest.mark.parametrize("newer", INSTALLED)
-def test_what_changed_is_installed_again(installs, newer):
-    folder, ran, _ = installs
-    tasks.set_up("test")
-    tasks.set_up("test")
-    assert set(ran) == {(*tasks.INSTALL, ".[test]"), tasks.ENGINE} and len(ran) == 2 and (folder / "ready").exists()
-    later = (folder / "ready").stat().st_mtime + 10
-    os.utime(folder / newer, (later, later))
-    tasks.set_up("test")
-    assert len(ran) == 4
-
-
 @pytest.mark.parametrize("required", ["", "1"])
 def test_without_a_compiler_all_but_the_engine_is_installed(installs, monkeypatch, capsys, required):
     folder, _, failing = installs
@@ -135,7 +96,6 @@ needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is
 
 
 def build(backend: str, hook: str, source: Path, out: Path, **environment: str) -> subprocess.CompletedProcess:
-    """Call a hook of a build backend, as pip does."""
     command = [sys.executable, "-c", f"from {backend} import {hook}; {hook}({str(out)!r})"]
     return subprocess.run(command, cwd=source, env={**os.environ, **environment}, capture_output=True, text=True)
 
@@ -181,7 +141,6 @@ def test_the_source_distribution_holds_every_source(tmp_path, backend, root, pat
 
 
 def test_nobody_is_told_to_install_cortado_from_the_package_index():
-    """It is not there, and another project has the name cortado."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["name"] == "cortado-sph"
     pages = [ROOT / "README.md", ROOT / "requirements-tested.txt", *(ROOT / "docs").rglob("*.md")]

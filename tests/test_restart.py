@@ -9,7 +9,7 @@ import pytest
 
 import cortado.cli.run as run_recording
 from bad_scenes import assert_one_sentence
-from cortado import InputError, Scene, Simulation, Trajectory, load_scene
+from cortado import InputError, Scene, Simulation, Trajectory
 from cortado.runs.frames import Marks
 from cortado.scene.restart import Clock
 from scenes import jet, plane, plane_of_three, pool_text, pour, two_layers
@@ -19,7 +19,6 @@ MAKERS = {"plane": plane, "two layers": two_layers, "plane of three": plane_of_t
 
 
 def controls_of(simulation):
-    """Gravity, and a nozzle's path where there is one, that change in every step."""
     steps, d = FIRST + REST, simulation.dimension
     sway = 0.01 * np.sin(0.3 * np.arange(steps))[:, None] * np.eye(d)[0]
     controls = {"gravity": np.array(simulation.scene.forces.gravity) + 100.0 * sway}
@@ -28,8 +27,7 @@ def controls_of(simulation):
     return controls
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(("name", "precision"), list(zip(MAKERS, 3 * ["float32", "float64"], strict=False)))
 def test_a_restart_has_the_bits_of_a_run_that_did_not_stop(name, precision, tmp_path):
     simulation = Simulation(MAKERS[name](), precision=precision)
     controls = controls_of(simulation)
@@ -58,6 +56,8 @@ def test_states_that_do_not_fit_are_refused():
     state = simulation.run(3).last_state
 
     x, n, wrong = state["positions"], simulation.particles, "state mass_fractions of particle 0 are"
+    twice = x.copy()
+    twice[7] = twice[3]
 
     def other(**fields):
         return replace(state, fields={**state.fields, **fields})
@@ -66,6 +66,7 @@ def test_states_that_do_not_fit_are_refused():
     for given, controls, what in [
         (other(positions=x[:-1]), {}, "state positions has shape"),
         (other(positions=x + [0.0, 0.0, 5.0]), {}, "positions has particle 0 at .* m, outside the container of this"),
+        (other(positions=twice), {}, "particles 3 and 7 at one place"),
         (other(reference_density=np.zeros(n)), {}, "state reference_density must be greater than 0"),
         (other(mass_fractions=np.full((n, 2), [2.0, -1.0])), {}, f"{wrong} 2, -1"),
         (other(mass_fractions=np.full((n, 2), [0.9, 0.2])), {}, f"{wrong} 0.9, 0.2"),
@@ -97,7 +98,6 @@ def test_an_emitter_goes_on_with_another_flow():
 
 
 def test_a_run_goes_on_from_a_frame_on_the_way():
-    """Also where a nozzle is moved, whose outlets are kept frame by frame."""
     simulation = Simulation(jet())
     path = simulation.parameters()["nozzle.path"] + np.linspace(0.0, 0.02, 6)[:, None]
     whole = simulation.run(6, {"nozzle.path": path})
@@ -108,7 +108,6 @@ def test_a_run_goes_on_from_a_frame_on_the_way():
 
 
 def spread_out(factor):
-    """A plane of as many particles, with a spacing so many times as large."""
     tables = plane().model_dump(exclude_none=True)
     (fluid,), cut = tables["fluid"], tables["discretisation"]
     fluid["upper"] = [factor * x for x in fluid["upper"]]
@@ -125,10 +124,8 @@ def refused(simulation, state, controls=None):
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-@pytest.mark.parametrize("factor", [0.5, 1.6])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(("factor", "known"), [(0.5, True), (1.6, False)])
 def test_a_state_of_another_spacing_is_refused(factor, known):
-    """Also where it does not say what it is of."""
     simulation, other = Simulation(plane()), Simulation(spread_out(factor))
     assert simulation.particles == other.particles
     state = other.run(2).last_state
@@ -141,7 +138,6 @@ def test_a_state_of_another_spacing_is_refused(factor, known):
     [
         ("phase.0.rest_density=900", "density of 900 kg/m3, but must be of one with a rest density of 1000 kg/m3"),
         ('discretisation.kernel="wendland_c2"', "the kernel wendland_c2"),
-        ("discretisation.support=2.5", "a support of 2.5 spacings"),
         ("container.periodic=[true,false]", "periods of"),
     ],
 )
@@ -153,15 +149,15 @@ def test_a_state_of_other_particles_is_refused(override, words, tmp_path):
         assert words in refused(Simulation(scene), state)
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("make", [plane, two_layers, plane_of_three, pour])
-@pytest.mark.parametrize("factor", [0.5, 0.9, 1.2])
+@pytest.mark.parametrize(
+    ("make", "factor", "known"),
+    [(plane, 0.5, True), (plane, 1.2, False), (plane_of_three, 0.9, False), (pour, 1.2, True), (pour, 0.9, False)],
+)
 def test_reference_densities_of_other_fluid_are_refused(make, factor, known):
     simulation = Simulation(make())
     state = simulation.run(2).last_state
     wrong = replace(state, fields={**state.fields, "reference_density": factor * state["reference_density"]})
-    sentence = refused(simulation, wrong if known else replace(wrong, origin=None))
-    assert "reference_density" in sentence
+    assert "reference_density" in refused(simulation, wrong if known else replace(wrong, origin=None))
 
 
 @pytest.mark.parametrize("make", [plane, two_layers])
@@ -177,24 +173,12 @@ def test_a_run_with_a_rest_density_goes_on_with_it_and_not_without(make):
     refused(simulation, simulation.run(5).last_state, controls)
 
 
-def test_particles_of_a_state_that_cannot_be_are_refused():
-    simulation = Simulation(plane())
-    state, other = (simulation.run(2).last_state for _ in range(2))
-    state["mass_fractions"][5] = 2.0
-    found = refused(simulation, state)
-    assert found == "state mass_fractions of particle 5 are 2, but must be from 0 to 1 and add up to 1."
-    other["positions"][7] = other["positions"][3]
-    assert "particles 3 and 7 at one place" in refused(simulation, other)
-
-
 @pytest.mark.parametrize(
     ("clock", "words"),
     [
         (Clock(3, np.nan), "finite time of at least 0 s"),
-        (Clock(3, np.inf), "finite time of at least 0 s"),
         (Clock(3, -5.0), "is at -5.0 s"),
         (Clock(-1, 0.0), "has -1 steps"),
-        (Clock(2.5, 0.0), "has 2.5 steps"),
         (0.1, "must be a Clock"),
     ],
 )
@@ -202,18 +186,6 @@ def test_a_clock_that_cannot_be_is_refused(clock, words):
     simulation = Simulation(plane())
     sentence = refused(simulation, replace(simulation.run(2).last_state, clock=clock))
     assert sentence.startswith("state clock") and words in sentence
-
-
-def test_a_state_is_of_its_own():
-    trajectory = Simulation(plane()).run(2)
-    state, before = trajectory.last_state, trajectory.positions.copy()
-    state["positions"][:] = 0.0
-    state["reference_density"][:] = 0.0
-    np.testing.assert_array_equal(trajectory.positions, before)
-    assert trajectory.constants["reference_density"].all()
-    state = trajectory.last_state
-    trajectory.positions[:] = 0.0
-    np.testing.assert_array_equal(state["positions"], before[-1])
 
 
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
@@ -257,7 +229,6 @@ def folder(tmp_path, monkeypatch):
 
 
 def files(run):
-    """What a run left, but for where and how fast it ran."""
     found = Trajectory.load(Path(run) / "trajectory.vtkhdf")
     arrays = {name: getattr(found, name) for name in ("times", "steps", "positions", "velocities")}
     arrays |= {**found.diagnostics, **found.others, **found.constants, **found.quantities}
@@ -326,23 +297,21 @@ def test_a_run_that_has_ended_goes_on_to_its_pictures(cortado_command):
     assert_same_files("whole", "dam")
 
 
-@pytest.mark.parametrize("place", ["first", "first/trajectory.vtkhdf"])
-def test_a_run_begins_at_the_end_of_another(cortado_command, place):
+def test_a_run_begins_at_the_end_of_another(cortado_command):
     cortado_command("run", "scene.toml", "--out", "whole", "--steps", 10)
     cortado_command("run", "scene.toml", "--out", "first", "--steps", 6)
-    code, _, err = cortado_command("run", "scene.toml", "--out", "rest", "--steps", 4, "--state", place)
+    code, _, err = cortado_command("run", "scene.toml", "--out", "rest", "--steps", 4, "--state", "first")
     assert (code, err) == (0, "")
     whole, rest = (Trajectory.load(f"{run}/trajectory.vtkhdf") for run in ("whole", "rest"))
     for name in ("positions", "times", "steps"):
         np.testing.assert_array_equal(getattr(rest, name), getattr(whole, name)[6:])
     again = ["--out", "rest", "--steps", 4, "--resume", "--state"]
-    assert cortado_command("run", "scene.toml", *again, place)[0] == 0
+    assert cortado_command("run", "scene.toml", *again, "first/trajectory.vtkhdf")[0] == 0
     code, _, err = cortado_command("run", "scene.toml", *again, "whole")
     assert code == 2 and "state" in err
 
 
 def test_frames_come_at_a_rate(cortado_command):
-    """It is kept, and counts from where a run begins."""
     run = ("run", "scene.toml", "--out")
     cortado_command(*run, "first", "--steps", 5, "--fps", 29.97)
     for more in ([], ["--state", "first"]):
@@ -360,11 +329,9 @@ def test_frames_come_at_a_rate(cortado_command):
     [
         (["--resume"], ["There is no run in"]),
         (["--resume", "--overwrite"], ["--resume", "--overwrite"]),
-        (["--fps", "0"], ["--fps is 0, but must be"]),
         (["--fps", "nan"], ["--fps is nan, but must be"]),
         (["--fps", "30", "--record-every", "2"], ["--fps", "--record-every"]),
         (["--state", "nowhere"], ["There is no trajectory file nowhere"]),
-        (["--state", "scene.toml"], ["cannot be read as a VTKHDF trajectory"]),
         (["--state", "."], ["There is no run in", "--state must be the folder of one"]),
     ],
 )
@@ -372,17 +339,3 @@ def test_wrong_arguments_are_sentences(cortado_command, options, words):
     code, out, err = cortado_command("run", "scene.toml", "--steps", 2, "--out", "dam", *options)
     assert (code, out) == (2, "") and all(word in err for word in words), err
     assert_one_sentence(err.removesuffix("\n"))
-
-
-def test_another_run_is_not_gone_on_with(cortado_command):
-    cortado_command("run", "scene.toml", "--out", "dam", "--steps", 3)
-    for options, word in (([4, "--resume"], "steps"), ([3], "--resume")):
-        code, _, err = cortado_command("run", "scene.toml", "--out", "dam", "--steps", *options)
-        assert code == 2 and word in err
-
-
-def test_the_middle_of_a_run_has_no_backward_pass():
-    rollout = Simulation(load_scene("scene.toml")).rollout(3)
-    rollout.progress = run_recording.Progress(1, rollout.initial)
-    with pytest.raises(InputError, match="keep is True"):
-        rollout.forward(keep=True)

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -11,12 +10,7 @@ import pytest
 from PIL import Image
 
 from bad_scenes import assert_one_sentence
-from bad_tasks import TINY_LATTE
 from cortado.cli import main
-from cortado.gradients import AdjointViscosity, Exact
-from cortado.optimisation.optimise import optimise
-from cortado.optimisation.optimisers import Adam
-from cortado.optimisation.task_files import load_task, setup
 from cortado.reference import Simulation, Terms
 from experiments.__main__ import EXPERIMENTS as EXPERIMENTS_PROGRAM
 from experiments.experiment_files import load_experiment
@@ -26,7 +20,6 @@ from experiments.image_horizon import ADJOINT, TAPE
 from experiments.pressure_terms import ONE_STEP, PROPAGATED
 from experiments.scenes import varied
 from experiments.tables import Table
-from experiments.task import TASK, TaskSettings
 from experiments.term_sizes import term_sizes
 from scenes import scene
 
@@ -36,7 +29,6 @@ FIGURES = ["figure_1", "figure_2_small", "figure_3_small", "figure_4", "figure_5
 
 @pytest.fixture
 def gradients(cortado_command):
-    """Runs ``cortado gradients ...`` in this process: (exit code, stdout, stderr)."""
     return partial(cortado_command, program=EXPERIMENTS_PROGRAM)
 
 
@@ -77,25 +69,6 @@ def test_pictures_come_nearer_to_the_target(measured):
     assert losses[-1] < 0.5 * losses[len(losses) // 3 * 2]
     assert table.values("picture")[:3] == ["", "target", "iteration 0"]
     assert len(table.where(picture="target")) == 32 * 32
-
-
-def test_a_task_is_searched_with_its_own_gradient(tmp_path):
-    """Its losses are those of a search with the estimator, and others without."""
-    file = tmp_path / "task.toml"
-    file.write_text(TINY_LATTE)
-    losses = {}
-    for name, estimator in (("adjoint_viscosity", AdjointViscosity()), ("exact", Exact())):
-        overrides = [f"optimise.gradient.name={name}"]
-        settings = TaskSettings(title="a cup", task=str(file), overrides=overrides)
-        made = setup(load_task(file, overrides), "cpu", "float32")
-        wanted = optimise(made.search, made.start, Adam(0.5), 3, gradient=estimator)
-        losses[name] = TASK.measure(settings, no_progress).where(picture="")["loss"]
-        np.testing.assert_array_equal(losses[name], [record.loss for record in wanted.history])
-    assert (losses["adjoint_viscosity"][1:] != losses["exact"][1:]).all()
-
-
-def no_progress(total):
-    return nullcontext(lambda n=1, **fields: None)
 
 
 def test_autograd_and_the_adjoint_agree_with_differences_while_little_has_grown(measured):
@@ -162,18 +135,12 @@ GOOD = (EXPERIMENTS / "figure_6.toml").read_text().replace("scenes/", f"{EXPERIM
     ("old", "new", "words"),
     [
         ('kind = "forces"', 'kind = "force"', ["experiment.toml: kind is 'force'", '"forces"']),
-        ('kind = "forces"', "", ["kind is missing"]),
-        ('kind = "forces"', 'kind = ["forces"]', ["experiment.toml: kind is ['forces']", '"forces"']),
         ("steps = 400", "steps = 4", ["experiment.toml: steps is 4", "from 8"]),
         ("steps = 400", "step = 400", ["step is not a key", "did you mean steps?"]),
         ("impact = 150", "", ["impact is missing", "a whole number"]),
         ("impact = 150", "impact = 150\ndifferences = [0.1, -0.1]", ["differences[1] is -0.1", "greater than 0 m/s2"]),
-        ("impact = 150", "impact = 150\ndifferences = []", ["differences is []", "at least one"]),
-        ("impact = 150", 'impact = 150\nprecision = "double"', ["precision is 'double'", '"float80"']),
         ("[reduced]", "[[reduced]]", ["reduced is"]),
         ("scenes/splash.toml", "scenes/absent.toml", ["absent.toml: the scene cannot be read"]),
-        ("scene = ", "scene = 3 #", ["scene is 3", "the path of a scene"]),
-        ("scene = ", 'scene = { file = "x", solver = 3 } #', ["cannot be read"]),
         ("scene = ", "scene = { dimension = 2 } #", ["experiment.toml: discretisation is missing"]),
     ],
 )
@@ -212,7 +179,6 @@ def test_a_figure_is_drawn_again_from_its_numbers(measured, tmp_path, gradients)
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two experiments: one that is quick, one for a GPU."""
     made = tmp_path / "experiments"
     made.mkdir()
     (made / "quick.toml").write_text(GOOD.replace("steps = 400", "steps = 20").replace("impact = 150", "impact = 5"))
@@ -241,13 +207,3 @@ def test_an_experiment_that_fails_does_not_stop_the_study(folder, tmp_path, grad
     code, printed, err = gradients("study", folder, "--out", tmp_path / "study")
     assert code == 1 and "These experiments failed: remote." in err
     assert "Failed: device is 'cuda:99'" in printed and "Analytic, all forces" in printed
-
-
-def test_a_study_of_nothing_and_an_unknown_name_are_refused(tmp_path, folder, gradients):
-    for arguments, words in [
-        ([tmp_path], "no experiments"),
-        ([tmp_path, "--only", "a"], "no experiments"),
-        ([folder, "--only", "figure_9"], "--only is 'figure_9', but must be one of quick, remote."),
-    ]:
-        code, out, err = gradients("study", *arguments)
-        assert (code, out) == (2, "") and words in err

@@ -20,7 +20,6 @@ from full_disk import largest_file
 
 WRITER = """
 import sys
-import time
 import numpy as np
 from cortado.files.vtkhdf import TrajectoryWriter
 
@@ -31,22 +30,6 @@ with TrajectoryWriter(sys.argv[1], times=times, particles=50, dimension=3, steps
     for k in range(100_000):
         writer.append_steps(iterations=k, density_errors=0.5 * k)
         writer.append(rows + k, rows - k, step=k + 1, others={"emitted": [0.1 * k]})
-        time.sleep(float(sys.argv[2]))
-"""
-
-READER = """
-import sys
-from vtkmodules.vtkIOHDF import vtkHDFReader
-
-for _ in range(60):
-    reader = vtkHDFReader()
-    reader.SetFileName(sys.argv[1])
-    reader.UpdateInformation()
-    assert reader.GetNumberOfSteps() == 100_000
-    for frame, vertices in ((0, 50), (99_999, 0)):
-        reader.SetStep(frame)
-        reader.Update()
-        assert reader.GetOutput().GetNumberOfVerts() == vertices
 """
 
 
@@ -55,15 +38,10 @@ def example(dimension: int, dtype: type = np.float64) -> Trajectory:
     positions, velocities = generator.normal(size=(2, 4, 6, dimension)).astype(dtype)
     diagnostics = {"iterations": [5, 4, 3, 9, 2], "density_errors": [0.1, 0.02, 0.03, 0.2, 0.01]}
     diagnostics["converged"] = [True, True, True, False, True]
-    return Trajectory(
-        times=np.array([0.0, 0.1, 0.2, 0.25]),
-        steps=np.array([0, 2, 4, 5]),
-        positions=positions,
-        velocities=velocities,
-        diagnostics={name: np.array(values) for name, values in diagnostics.items()},
-        others={"emitted": np.array([[0.0], [0.1], [0.2], [0.3]])},
-        constants={"reference_density": np.full(6, 1000.0)},
-    )
+    diagnostics = {name: np.array(values) for name, values in diagnostics.items()}
+    others, constants = {"emitted": 0.1 * np.arange(4.0)[:, None]}, {"reference_density": np.full(6, 1000.0)}
+    times, steps = np.array([0.0, 0.1, 0.2, 0.25]), np.array([0, 2, 4, 5])
+    return Trajectory(times, steps, positions, velocities, diagnostics, others=others, constants=constants)
 
 
 def require_same(found: Trajectory, wanted: Trajectory) -> None:
@@ -98,8 +76,7 @@ def frames_seen_by_vtk(path: Path, chosen: list[int] | None = None) -> tuple[lis
     return list(times), frames
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("dimension", "dtype"), [(2, np.float32), (3, np.float64)])
 def test_saved_trajectory_comes_back(tmp_path, dimension, dtype):
     saved = example(dimension, dtype)
     saved.save(tmp_path / "a.vtkhdf")
@@ -108,18 +85,6 @@ def test_saved_trajectory_comes_back(tmp_path, dimension, dtype):
     assert loaded.positions.dtype == dtype
     assert (loaded.dimension, loaded.particles, loaded.not_converged) == (dimension, 6, 1)
     assert os.listdir(tmp_path) == ["a.vtkhdf"]
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_vtk_sees_every_frame(tmp_path, dimension):
-    saved = example(dimension)
-    saved.save(tmp_path / "a.vtkhdf")
-    times, frames = frames_seen_by_vtk(tmp_path / "a.vtkhdf")
-    assert times == saved.times.tolist() and len(frames) == 4
-    for k, (points, velocities, vertices) in enumerate(frames):
-        np.testing.assert_array_equal(points[:, :dimension], saved.positions[k])
-        np.testing.assert_array_equal(velocities[:, :dimension], saved.velocities[k])
-        assert not points[:, dimension:].any() and vertices == 6
 
 
 def test_file_can_be_read_while_it_grows(tmp_path):
@@ -136,7 +101,7 @@ def test_file_can_be_read_while_it_grows(tmp_path):
             np.testing.assert_array_equal(arrays["density"][k], 1000.0 + np.arange(5) + k)
             np.testing.assert_array_equal(arrays["pressure"][k], np.full(5, k))
             times, frames = frames_seen_by_vtk(file)
-            assert times == list(range(9))
+            assert times == list(range(9)) and (frames[k][0] == [k, k, 0.0]).all() and (frames[k][1] == [1, 1, 0]).all()
             assert [vertices for *_, vertices in frames] == [5] * (k + 1) + [0] * (8 - k)
 
 
@@ -144,7 +109,7 @@ def test_killed_writer_leaves_its_frames(tmp_path):
     paths = [tmp_path / f"{k}.vtkhdf" for k in range(8)]
     rows = np.arange(50.0)[:, None] * np.ones(3)
     for path in paths:
-        writer = subprocess.Popen([sys.executable, "-c", WRITER, path, "0"])
+        writer = subprocess.Popen([sys.executable, "-c", WRITER, path])
         deadline = time.monotonic() + 20
         while not path.exists() and time.monotonic() < deadline:
             time.sleep(0.0005)
@@ -226,21 +191,6 @@ def test_a_number_that_says_how_to_read_is_covered_too(tmp_path, name):
         read(tmp_path / "a.vtkhdf")
 
 
-def test_vtk_opens_a_file_that_grows(tmp_path):
-    path = tmp_path / "a.vtkhdf"
-    writer = subprocess.Popen([sys.executable, "-c", WRITER, path, "0.0002"])
-    try:
-        while not path.exists():
-            assert writer.poll() is None
-            time.sleep(0.0005)
-        reader = subprocess.run([sys.executable, "-c", READER, path], capture_output=True, text=True, timeout=60)
-        assert writer.poll() is None
-    finally:
-        writer.kill()
-        writer.wait()
-    assert reader.returncode == 0, reader.stderr
-
-
 def test_a_disk_without_room_is_a_sentence_before_anything_is_computed(tmp_path):
     options = {"times": np.arange(1000), "dimension": 2, "particles": 1000}
     with largest_file(100_000), pytest.raises(ComputationError, match="a cannot be written: File too large"):
@@ -269,34 +219,6 @@ def test_a_disk_that_fills_up_leaves_the_frames_before(tmp_path, monkeypatch):
         writer.append_steps(iterations=5)
     assert [frame[0, 0] for frame in read(tmp_path / "a")["positions"]] == [1.0, 3.0]
     assert read(tmp_path / "a")["diagnostics"]["iterations"].tolist() == [3, 5]
-
-
-def test_writer_refuses_what_was_not_announced(tmp_path):
-    rows, outlet = np.zeros((3, 2)), {"outlet": np.zeros((1, 2))}
-    sizes = {"particles": 3, "dimension": 2}
-    for place, times, words in [("no/a", [0.0], "cannot be written"), ("a", [], "at least 1 frame")]:
-        with pytest.raises(InputError, match=words):
-            TrajectoryWriter(tmp_path / place, times=times, **sizes)
-    counted = {"steps": 1, "diagnostics": {"iterations": int}}
-    with TrajectoryWriter(tmp_path / "a", times=[0.0], others=outlet, **sizes, **counted) as writer:
-        for positions, more, words in [
-            (np.zeros((3, 3)), {"others": outlet}, r"positions of shape \(3, 2\)"),
-            (rows, {"pressure": np.zeros(3)}, "pressure"),
-            (rows, {}, r"the other fields \['outlet'\], found \[\]"),
-            (rows, {"others": {"outlet": np.zeros(2)}}, r"outlet of shape \(1, 2\), found \(2,\)"),
-        ]:
-            with pytest.raises(InputError, match=words):
-                writer.append(positions, rows, **more)
-        writer.append(rows, rows, others=outlet)
-        with pytest.raises(InputError, match="1 frames, but one more was given"):
-            writer.append(rows, rows)
-        with pytest.raises(InputError, match="1 steps, but 2 were given"):
-            writer.append_steps(iterations=[5, 5])
-        with pytest.raises(InputError, match=r"the diagnostics \['iterations'\], found \['density_errors'\]"):
-            writer.append_steps(density_errors=[0.1])
-    with TrajectoryWriter(tmp_path / "b", times=[0.0], **sizes):
-        pass
-    assert os.listdir(tmp_path) == ["a"]
 
 
 @pytest.mark.parametrize("name", ["run.npz", "run", "run.mp4"])

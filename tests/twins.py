@@ -19,19 +19,10 @@ def twin(simulation):
         search.walls["wall_weights"].numpy().astype(np.float64),
     )
     viscous = [force for force in simulation.solver.forces if isinstance(force, Viscosity)]
-    return reference.Pcisph(
-        simulation.solver.discretisation.smoothing,
-        d,
-        lattice.support,
-        lattice.volume,
-        lattice.stiffness,
-        *walls,
-        viscosity=simulation.scene.forces.viscosity,
-        sticks=bool(viscous) and viscous[0].sticks,
-        reach=1.03 * lattice.support,
-        response=lattice.response,
-        stress=stress_twin(simulation, *walls),
-    )
+    options = {"viscosity": simulation.scene.forces.viscosity, "sticks": bool(viscous) and viscous[0].sticks}
+    options |= {"reach": 1.03 * lattice.support, "response": lattice.response}
+    kernel, options["stress"] = simulation.solver.discretisation.smoothing, stress_twin(simulation, *walls)
+    return reference.Pcisph(kernel, d, lattice.support, lattice.volume, lattice.stiffness, *walls, **options)
 
 
 def stress_twin(simulation, walls, wall_weights, sticks=None):
@@ -40,14 +31,9 @@ def stress_twin(simulation, walls, wall_weights, sticks=None):
     solver, scene, d = simulation.solver, simulation.scene, simulation.dimension
     lattice, spacing = solver.lattice, scene.discretisation.spacing
     feet = solver.search.walls["wall_feet"].numpy()[:, :d].astype(np.float64)
-    return Stress(
-        lattice.volume,
-        stress_control(solver.discretisation.smoothing, spacing, lattice.support, d),
-        0.25 * spacing,
-        walls,
-        wall_weights,
-        feet if sticks or (sticks is None and getattr(scene.container, "slip", "free") == "no") else None,
-    )
+    control = stress_control(solver.discretisation.smoothing, spacing, lattice.support, d)
+    held = sticks or (sticks is None and getattr(scene.container, "slip", "free") == "no")
+    return Stress(lattice.volume, control, 0.25 * spacing, walls, wall_weights, feet if held else None)
 
 
 def tension_twin(simulation):

@@ -157,16 +157,10 @@ class Channel:
         spacing, fastest = 1.0 / self.across, 2.0 * self.reynolds * NU
         step = min(0.09 * spacing**2 / NU, 0.2 * spacing / fastest)
         steps = int(np.ceil(self.time / step))
-        one = simulation(
-            [10.0 * spacing, 1.0],
-            spacing,
-            self.kernel,
-            self.form,
-            [Body(band, push=self.push, low=self.low, high=1.0 - self.low)],
-            container={"periodic": [True, False], "slip": "no"},
-            forces={"pressure": self.pressure},
-            solver={"kind": "pcisph", "time_step": self.time / steps, **SOLVERS[self.solver]},
-        )
+        tables = {"container": {"periodic": [True, False], "slip": "no"}, "forces": {"pressure": self.pressure}}
+        tables["solver"] = {"kind": "pcisph", "time_step": self.time / steps, **SOLVERS[self.solver]}
+        pushed = Body(band, push=self.push, low=self.low, high=1.0 - self.low)
+        one = simulation([10.0 * spacing, 1.0], spacing, self.kernel, self.form, [pushed], **tables)
         y = one.positions[:, 1]
         v = np.column_stack([self.exact(y), np.zeros(len(y))])
         problem, dot = Problem(one, steps, CentreOfMass(np.zeros(2))), np.zeros(0)
