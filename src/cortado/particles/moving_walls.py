@@ -1,7 +1,6 @@
 """Arrays of wall particles, and the wall particles of moving solids.
 
-Wall particles of moving solids have the positions at the end of a time step, and the velocity of the nearest point on
-the surface.
+Wall particles of moving solids have positions at the end of a time step, and the velocity of the nearest surface point.
 
 A solid may be stretched about its middle by a scale sigma. In the solid's frame a wall particle has the position r and
 the weight w, and q is the nearest point on the surface. The vector to the surface is f = q - r. With the middle c and

@@ -1,5 +1,4 @@
-"""Sums over neighbours, each made from the term of one pair of particles: a function whose parameter names define its
-inputs.
+"""Sums over neighbours, each made of the term of a pair of particles: a function whose parameter names are its inputs.
 
     @pair_sum(discretisation)
     def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:

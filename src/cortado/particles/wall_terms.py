@@ -243,8 +243,7 @@ def solid_kernel(
 ) -> Any:
     """Make the kernel of one sum for `SolidShares.add`. ``topic`` names its Warp module.
 
-    ``make(discretisation)`` returns the work of a term of walls. It may call only functions that Warp can
-    differentiate.
+    ``make(discretisation)`` returns the work of a term of walls. It may call only functions with derivatives in Warp.
     """
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))

@@ -259,11 +259,9 @@ CAMERA = ("position", "look_at", "field_of_view", "extinction")
 
 
 def scene_renderer(simulation: Any, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """Make a renderer for the particles of a `cortado.Simulation` from the table [render] of its scene. The default is
-    a view from above.
+    """Make a renderer for a `cortado.Simulation` from the table [render] of its scene, by default a view from above.
 
-    The extinction is multiplied by ``extinction_factor``. ``settings`` replace keys of the table; see
-    `Simulation.renderer`.
+    ``extinction_factor`` multiplies the extinction. ``settings`` replace keys of the table; see `Simulation.renderer`.
     """
     scene, dimension, x = simulation.scene, simulation.dimension, simulation.positions
     cut, ends = scene.discretisation, scene.container.extent()

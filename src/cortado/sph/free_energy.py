@@ -100,8 +100,7 @@ class Mobility:
     name: str
     greatest: Callable[[int], float]
     functions: Callable[[Precision, int], Any]
-    """Function from a precision and a number of phases to an object with the Warp functions ``value`` and ``gradient``
-    of the mobility."""
+    """Function from a precision and a number of phases to the mobility's Warp functions ``value`` and ``gradient``."""
 
 
 @cache

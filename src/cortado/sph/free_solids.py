@@ -190,8 +190,7 @@ class Motions:
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
-        """Momentum and angular momentum by contacts, springs and friction, and for no-slip bodies by the pressures of
-        the previous step."""
+        """Momenta by contacts, springs and friction, and for no-slip bodies by the pressures of the previous step."""
 
 
 class FreeBody(Motions):

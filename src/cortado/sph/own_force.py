@@ -38,8 +38,7 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 
 class OverTime:
-    """A parameter of a force that changes in time. It is linear between the given times, and constant before the first
-    and after the last time.
+    """A parameter of a force that changes in time: linear between the given times, and constant before and after them.
 
     A step uses the value at its middle. A search may use one value for each step.
 

@@ -134,8 +134,7 @@ class Adjoints:
     def named(self) -> tuple[Named, ...]:
         """Return the adjoints by kernel argument name, such as ``x_bar``.
 
-        Adjoints of parameters over time are sums (members, steps). Adjoints of parameters in ``shares`` are terms of
-        particles.
+        Those of parameters over time are sums (members, steps), and those of parameters in ``shares`` terms (n,).
         """
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
@@ -168,8 +167,7 @@ class Force(Protocol):
         """Write the sum of ``before`` and this force's acceleration to ``after``. All three are (n,) vectors."""
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        """Write the sum of ``before`` and the tangent of this force's acceleration to ``after``. All three are (n,)
-        vectors."""
+        """Write the sum of ``before`` and the tangent of this force's acceleration to ``after``, (n,) vectors."""
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
         """Add to the adjoints ``bar`` of the force's inputs, given the adjoint of the acceleration, (n,) vectors.

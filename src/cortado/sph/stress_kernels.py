@@ -31,8 +31,7 @@ where M has no inverse. With the invariants I_2 and I_3 of M,
 
     H = 3 I_3 / I_2 (in 2-D 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
-H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S > 0, det M is at least 0.008, so that the inverse
-needs no guard.
+H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S > 0, det M is at least 0.008: M has an inverse.
 
 Users' functions may take velocity gradients S G, with sums over fluid alone. Walls without slip are in
 `cortado.sph.stress_forces`.

@@ -138,8 +138,7 @@ RELAXED = {2: 1.1, 3: 1.25}
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
 """Smallest support radius for each kind of surface tension [spacings]."""
 LEAST_VISCOSITY = 0.05
-"""Smallest viscosity of stable drops, relative to sqrt(rho sigma R) with density rho, surface tension sigma and radius
-R [-]."""
+"""Least viscosity of stable drops over sqrt(rho sigma R), with density rho, surface tension sigma and radius R [-]."""
 
 
 class SurfaceTension:
