@@ -62,7 +62,6 @@ def places(value: Any, path: tuple = ()) -> Iterator[tuple]:
 
 
 def table_at(made: Table, path: tuple) -> type[Table]:
-    """Which table has the key at the end of a path."""
     table: Any = made
     for part in path[:-1]:
         table = table[part] if isinstance(part, int) else getattr(table, part)
@@ -101,12 +100,10 @@ def changed(value: Any, schema: dict[str, Any], index: int = 0) -> Any:
 
 
 def _words(schema: dict[str, Any]) -> list[str]:
-    """The options that a key has."""
     return [word for part in (schema, *schema.get("anyOf", ())) for word in part.get("enum", ())]
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two effects have the same bits."""
     if isinstance(one, np.ndarray):
         return isinstance(other, np.ndarray) and np.array_equal(one, other, equal_nan=True)
     if isinstance(one, dict):
@@ -131,7 +128,6 @@ def numbers(path: Path) -> Any:
 
 
 def told(make: Any) -> tuple[Any, list[str]]:
-    """What is made, and what is warned of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CortadoWarning)
         return make(), sorted(str(one.message) for one in caught)

@@ -54,7 +54,6 @@ class Body:
         return np.block([[np.diag(hold.moving), np.cross(turns, across).T], [np.zeros((3, 3)), turns]])
 
     def rows(self, gamma, x):
-        """(6, n) what pressures give to both momenta."""
         arm, force = (np.pad(a, ((0, 0), (0, 3 - a.shape[1]))) for a in (x - self.middle, gamma))
         return np.hstack([force, np.cross(arm, force)]).T
 
@@ -63,7 +62,6 @@ class Body:
         return self.mobility[:, :d] @ np.broadcast_to(gravity, d) * (self.mass * dt)
 
     def diagonal(self, rows):
-        """What it adds to a."""
         force, torque = np.linalg.norm(rows[:3], axis=0), np.linalg.norm(rows[3:], axis=0)
         return self.bounds[0] * force * force.sum() + self.bounds[1] * torque * torque.sum()
 
@@ -274,7 +272,6 @@ class Projection:
         return found + h * sum(np.einsum("ija,ja->i", g, swept) / dt for *_, g, swept in self.images(x))
 
     def body_rows(self, x):
-        """(6, n) of each body."""
         wall_g, least = self.pairs(x, self.walls)[2], 5e-4 * self.constants[1]
         (normal, whole) = self.pushes(wall_g)
         off = ((whole**2).sum(1) - (normal**2).sum(1)) / ((whole**2).sum(1) + least)
@@ -311,7 +308,6 @@ class Projection:
         a = ((own**2).sum(1) + 0.05 * square) / m
         unequal = 1 + 2 * ((m[:, None] - m) / (m[:, None] + m)) ** 2
         a += (unequal * (np.einsum("iab,ijb->ija", L, g) ** 2).sum(-1)) @ (1 / m)
-
         rows = self.body_rows(x)
         yielding = np.zeros((n, n))
         for body, row in zip(self.bodies, rows, strict=True):

@@ -18,7 +18,6 @@ TAU = 0.01
 
 @cache
 def memory_kernels(discretisation):
-    """Of the acceleration, and of the field."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     arrays, numbers, tau = wp.array(dtype=vector), wp.array(dtype=real), wp.constant(real(TAU))
     module, tangents = discretisation.module(True, "tests_memory"), discretisation.tangent_module("tests_memory")
@@ -83,8 +82,6 @@ def memory_kernels(discretisation):
 
 
 class MemoryForce(Part):
-    """The force in a solver, and the part that keeps its field."""
-
     fields = (U,)
     shares = ("memory.k",)
     batches = True
@@ -153,8 +150,6 @@ class MemoryAdjoint(PartAdjoint):
 
 
 class Memory:
-    """Makes it."""
-
     parameters = (Parameter("memory.k", "1/s", "rate", Axis.SCALAR, lambda source: 30.0),)
 
     def force(self, setting):

@@ -1,4 +1,4 @@
-"""A hundred bad uses of layers, environments and fits: each is refused in one sentence, before anything is computed."""
+"""Bad uses of layers, environments and fits: each is refused in one sentence, before anything is computed."""
 
 import re
 from functools import partial
@@ -11,7 +11,7 @@ import pytest
 import cortado
 import cortado.environments
 from bad_scenes import one_sentence
-from cortado import CortadoError, InputError, measured, sensors
+from cortado import CortadoError, measured, sensors
 from scenes import plane, pool
 from scenes import scene as box
 
@@ -21,7 +21,6 @@ PATH = "paddle.displacement"
 
 @pytest.fixture(scope="module")
 def at(jax):
-    """What the uses below go wrong with: 48 particles beside a paddle, in float64."""
     import cortado.jax
 
     made = SimpleNamespace(jax=jax, np=jax.numpy, layer=cortado.jax)
@@ -39,7 +38,7 @@ def at(jax):
     made.vec = cortado.environments.make_vec("Carry", 2, autoreset_mode="Disabled")
     for one in (made.env, made.closed, made.vec):
         one.reset(seed=1)
-    made.twin = made.env.twin(1)
+    made.twin, made.ones = made.env.twin(1), jax.numpy.ones((3, 2))
     made.closed.close()
     made.batch = cortado.Simulation(made.scene, precision="float64", batch=2)
     made.other = cortado.Simulation(plane(), precision="float64")
@@ -61,42 +60,22 @@ REFUSED = [
     # layers
     (lambda at: at.jax.jit(lambda k: at.step(steps=k)["positions"])(2), "steps is JitTracer(~int64[]), but must be a"),
     (
-        lambda at: at.jax.jit(lambda k: at.rollout(steps=2, record_every=k)["positions"])(2),
-        "record_every is JitTracer(~int64[]), but must be a whole number",
-    ),
-    (
-        lambda at: at.jax.vmap(lambda a: at.loss({"gravity": a}), in_axes=1)(at.np.ones((3, 2))),
+        lambda at: at.jax.vmap(lambda a: at.loss({"gravity": a}), in_axes=1)(at.ones),
         "parameter gravity has shape (3,), but must be (2,) or (4, 2).",
     ),
     (
-        lambda at: at.jax.vmap(
-            lambda a: at.layer.step(at.batch, at.layer.state(at.batch), {"gravity": a})["positions"]
-        )(at.np.ones((3, 2))),
+        lambda at: at.jax.vmap(lambda a: at.layer.step(at.batch, at.layer.state(at.batch), {"gravity": a}))(at.ones),
         "a simulation that is a batch of 2 cannot be mapped over a",
     ),
     (lambda at: at.jax.hessian(lambda a: at.loss({"gravity": a}))(at.gravity), "A second derivative is asked for"),
     (lambda at: at.loss({"paddel.displacement": at.np.zeros(2)}), "parameter 'paddel.displacement' is unknown, but"),
-    (lambda at: at.loss({PATH: np.zeros((4, 3))}), "parameter paddle.displacement has shape (4, 3), but must be"),
     (lambda at: at.step({PATH: at.np.zeros((4, 2))}, steps=2), "parameter paddle.displacement has shape (4, 2), but"),
-    (lambda at: at.step({PATH: at.np.full((1, 2), at.np.nan)}), "parameter paddle.displacement has a value that is"),
-    (lambda at: at.loss({"paddle.turn": at.np.zeros((4, 3))}), "parameter paddle.turn has shape (4, 3), but must be"),
-    (lambda at: at.loss({"paddle.swing": np.zeros(2)}), "parameter 'paddle.swing' is unknown, but must be one of"),
-    (lambda at: at.loss({"gravity": np.array(["a", "b"])}), "parameter gravity is made of text, but must be a number"),
-    (lambda at: at.loss({"gravity": np.array([None, 1], object)}), "parameter gravity is array([None, 1]"),
-    (lambda at: at.loss({"gravity": [[1, 2], [3]]}), "parameter gravity is [[1, 2], [3]], but must be a number or an"),
     (lambda at: at.jax.grad(lambda a: at.loss({"gravity": [a, 0.0]}))(1.0), "numbers: make one with jax.numpy.stack"),
-    (lambda at: at.loss({"gravity": {"x": 1.0}}), "parameter gravity is a table, but must be a number or an array"),
     (lambda at: at.loss({3: 1.0}), "parameters has the name 3, but must have texts as names."),
     (lambda at: at.step_from({**at.state, "positions": np.zeros((48, 2), np.float32)}), "state positions are usually"),
     (lambda at: at.step_from(at.layer.state(at.other)), "state has positions, velocities, mass_fractions,"),
     (lambda at: at.step_from(at.layer.state(at.batch)), "state positions has shape (2, 48, 2), but must be (48, 2)."),
-    (lambda at: at.layer.step(at.batch, at.state), "state positions has shape (48, 2), but must be (2, 48, 2)."),
     (lambda at: at.layer.step(cortado.Simulation(at.scene), at.state), "state positions is float64, but must be"),
-    (lambda at: at.layer.restart_state(at.batch, at.state), "state positions has shape (48, 2), but must be (2, 48"),
-    (lambda at: at.step(steps=-1), "steps is -1, but must be a whole number of at least 1."),
-    (lambda at: at.step(steps=True), "steps is True, but must be a whole number of at least 1."),
-    (lambda at: at.step(steps="2"), "steps is '2', but must be a whole number of at least 1."),
-    (lambda at: at.rollout(steps=2, record_every=0), "record_every is 0, but must be a whole number of at least 1."),
     (
         lambda at: at.rollout({"gravity": at.np.zeros((3, 2))}, steps=4, record_every=2),
         "parameter gravity has 3 rows, but must have 4, one for each",
@@ -106,75 +85,43 @@ REFUSED = [
     (lambda at: at.layer.value(at.problem, "exact"), "estimator is 'exact', but must be an object such as"),
     (lambda at: at.loss(at.gravity), "parameters is Array([ 0. , -9.81], dtype=float64), but must be"),
     (lambda at: at.measure(None), "sensor is None, but must be a sensor, such as one of"),
-    (lambda at: at.measure(sensors.WaveGauge), "sensor is "),
     (lambda at: at.measure(sensors.WaveGauge([0.1, 0.0, 0.1]))(at.state), "position has 3 components, but must have"),
-    (lambda at: at.layer.measure("x", "density"), "simulation is 'x', but must be a cortado.Simulation."),
-    (lambda at: at.measure("pressure")(at.state, {"gravty": at.gravity}), "parameter 'gravty' is unknown, but must"),
     (lambda at: at.picture(at.x[:3]), "positions has shape (3, 2), but must have (48, 2)."),
-    (lambda at: at.picture(at.x.astype("float32")), "positions is float32, but must be float64, the simulation's"),
     (lambda at: at.picture(at.x * np.nan), "positions has a value that is not finite, but must be made of"),
-    (lambda at: at.picture(np.zeros((48, 3))), "positions has shape (48, 3), but must have (48, 2)."),
-    (lambda at: at.picture(None), "positions is left out, but must be an array (48, 2)."),
     (lambda at: at.picture(at.x, colours=np.zeros(3)), "colours has shape (3,), but must have (1, 3)."),
     (lambda at: at.jax.jvp(at.picture, (at.x,), (at.x,)), "A picture has derivatives in reverse mode only: take a"),
     (lambda at: at.layer.state(at.simulation, at.state), "state is a table, but must be a RestartState, such as"),
     (lambda at: at.layer.state(at.simulation, at.other.state()), "state has positions, velocities, mass_fractions,"),
-    (lambda at: at.layer.state(at.problem), "simulation is Problem(4 steps of Simulation(48 particles, 1"),
     # environments
     (lambda at: at.act(np.zeros(3)), "action has shape (3,), but must be (2,)."),
     (lambda at: at.act(np.array([np.nan, 0])), "action has a value that is not finite, but must be numbers from"),
-    (lambda at: at.act(np.array([np.inf, 0])), "action has a value that is not finite, but must be numbers from"),
     (lambda at: at.act("left"), "action is 'left', but must be a number or an array of real"),
-    (lambda at: at.act(["a", "b"]), "action is made of text, but must be a number or an"),
-    (lambda at: at.act(np.array([1j, 0])), "action is made of complex numbers, but must be a number or an"),
-    (lambda at: at.act(None), "action is None, but must be a number or an array of real"),
     (lambda at: at.jax.jit(lambda a: at.act(a)[1])(at.np.zeros(2)), "action is JitTracer(float64[2]), but must be a"),
     (lambda at: at.env.reset(seed="a"), "seed is 'a', but must be a whole number or None."),
     (lambda at: at.vec.reset(seed="ab"), "seed is 'ab', but must be a whole number, or a list of them."),
-    (lambda at: at.vec.reset(seed=1.5), "seed is 1.5, but must be a whole number, or a list of them."),
     (lambda at: at.act_all(np.zeros(2)), "actions has shape (2,), but must be (2, 2)."),
-    (lambda at: at.act_all(np.full((2, 2), np.nan)), "actions has a value that is not finite, but must be numbers"),
     (lambda at: at.vec.twin(2), "number is 2, but must be at most 1."),
-    (lambda at: at.vec.twin(-1), "number is -1, but must be a whole number of at least 0."),
-    (lambda at: at.vec.twin("a"), "number is 'a', but must be a whole number of at least 0."),
     (lambda at: at.vec.reset(options={"reset_mask": np.zeros(3, bool)}), "reset_mask is array([False, False"),
-    (lambda at: at.vec.reset(options=[1]), "options is [1], but must be a table by name, such as {'state':"),
     (lambda at: at.twin.value(np.zeros((2, 2))), "actions has shape (2, 2), but must be (1, 2)."),
-    (lambda at: at.twin.value(np.full((1, 2), np.nan)), "actions has a value that is not finite, but must be numbers"),
-    (lambda at: at.twin.value(None), "actions is None, but must be a number or an array of real"),
-    (lambda at: at.twin.value_and_gradient(np.zeros((1, 2)), "exact"), "estimator is 'exact', but must be an object"),
     (lambda at: at.twin_in_jax(np.zeros((2, 2), np.float32)), "actions has shape (2, 2), but must be an array (1, 2)."),
     (lambda at: at.twin_in_jax(at.np.full((1, 2), at.np.nan, at.np.float32)), "parameter cup.displacement has a"),
-    (lambda at: at.env.twin("all"), "actions is 'all', but must be a whole number of at least 1."),
-    (lambda at: at.twin_in_jax(np.zeros(2, np.float32)), "actions has shape (2,), but must be an array (1, 2)."),
     (lambda at: at.closed.step(np.zeros(2)), "step is called after close(), but must come after reset()."),
     (lambda at: (at.vec.close(), at.act_all(np.zeros((2, 2)))), "step is called after close(), but must come before"),
     (lambda at: at.make_one(size=3), 'size is 3, but must be "small" or "large".'),
-    (lambda at: at.make_one(device="cuda:9"), "device is 'cuda:9', but must be one of: cpu; no GPU with a CUDA"),
-    (lambda at: cortado.environments.make_vec(3), "task is 3, but must be one of Carry, CarryInSpace, Latte, Pour"),
-    (lambda at: at.make(1.5), "num_envs is 1.5, but must be a whole number of at least 1."),
-    (lambda at: at.make(1, sensors={"a": sensors.WaveGauge}), "sensor is "),
     (lambda at: at.make(1, max_episode_steps=0), "max_episode_steps is 0, but must be a whole number of at least"),
     # fits
     (lambda at: at.fit([1.0]), "start is [1.0], but must be a table by name, such as {'viscosity':"),
     (lambda at: at.fit({}), "start is empty, but must have a parameter to fit."),
     (lambda at: at.fit({"viscocity": 1.0}), "parameter 'viscocity' is unknown, but must be one of gravity,"),
     (lambda at: at.fit({"viscosity": 1.0}, bounds={"viscosity": (1.0, 1.0)}), "0 free numbers"),
-    (lambda at: at.fit({"viscosity": np.nan}), "start of viscosity is nan, but must be within its bounds."),
-    (lambda at: at.fit({"viscosity": -1.0}), "parameter viscosity is -1.0, but must be at least 0."),
-    (lambda at: at.fit({"viscosity": "thick"}), "start of viscosity is 'thick', but must be a number or an array"),
     (lambda at: cortado.fit(at.simulation, {"viscosity": 1.0}), "experiments is Simulation(48 particles, 1 phase"),
     (lambda at: cortado.fit([], {"viscosity": 1.0}), "experiments is empty, but must have one experiment at least."),
     (lambda at: at.fit({"viscosity": 1.0}, bounds={"viscosity": (2.0, 3.0)}), "start of viscosity is 1.0, but must"),
-    (lambda at: at.fit({"viscosity": 1.0}, bounds={"viscosity": (3.0, 0.1)}), "start of viscosity is 1.0, but must"),
     (lambda at: at.fit({"viscosity": 1.0}, bounds={"gravity": (2.0, 3.0)}), "bounds has gravity, but must be made of"),
     (lambda at: at.seen({}), "observations is empty, but must have at least one measurement."),
-    (lambda at: measured.Experiment(at.problem, {"camera": at.video}), "simulation is Problem(4 steps of"),
-    (lambda at: at.seen([at.video]), "observations is ["),
     (lambda at: at.seen({"camera": at.frames}), "observations camera is array([[[[6.36961687e-01,"),
     (lambda at: at.film(at.times[:1], at.frames), "must be a list of at least 4 rising numbers, as error"),
     (lambda at: at.film(at.times[::-1], at.frames), "times has 0.012 s after 0.016 s, but must rise from frame"),
-    (lambda at: at.film(at.times, np.zeros((4, 5, 8, 3))), "frames has shape (4, 5, 8, 3), but must be (frames, *(8"),
     (
         lambda at: cortado.fit(at.seen({"c": at.film(at.times, at.frames * np.nan)}), {"viscosity": 1.0}),
         "measured must be finite, or NaN for numbers to ignore, but",
@@ -183,32 +130,12 @@ REFUSED = [
     (lambda at: measured.Experiment(cortado.Simulation(box()), {"c": at.video}), "observations c sees positions (48"),
     (lambda at: at.seen({"c": at.film(at.times - 1, at.frames)}), "times begin with -0.996 s, but must be finite and"),
 ]
-THEIRS = [
-    (lambda at: at.jax.grad(lambda v: at.step({"gravity": v})["positions"])(at.gravity), "Gradient only defined for"),
-    (lambda at: at.jax.jit(at.layer.step)(at.simulation, at.state), "Error interpreting"),
-    (lambda at: at.jax.jit(at.layer.value)(at.problem), "Error interpreting argument"),
-    (
-        lambda at: at.jax.vmap(lambda a, b: at.loss({"gravity": a, "viscosity": b}))(
-            at.np.zeros((2, 2)), at.np.zeros(3)
-        ),
-        "vmap got inconsistent sizes",
-    ),
-    (lambda at: at.env.reset(seed=-5), "Seed must be greater or equal to zero"),
-]
-"""What JAX and Gymnasium find first, in sentences of theirs."""
 
 
 @pytest.mark.parametrize("call, words", REFUSED, ids=[words for _, words in REFUSED])
 def test_a_bad_use_is_refused_in_a_sentence(at, call, words):
     with one_sentence(re.escape(words), error=CortadoError):
         call(at)
-
-
-@pytest.mark.parametrize("call, words", THEIRS, ids=[words for _, words in THEIRS])
-def test_what_others_refuse_has_their_words(at, call, words):
-    with pytest.raises(Exception, match=words) as caught:
-        call(at)
-    assert not isinstance(caught.value, InputError)
 
 
 def test_a_path_that_goes_on_in_segments_is_no_jump(at, recwarn):
@@ -220,22 +147,3 @@ def test_a_path_that_goes_on_in_segments_is_no_jump(at, recwarn):
         assert not [one for one in recwarn if issubclass(one.category, cortado.CortadoWarning)]
     with pytest.warns(cortado.CortadoWarning, match=r"goes 0\.21 m in step 1"):
         at.layer.step(simulation, state, {PATH: 20 * path}, steps=3)
-
-
-def test_paths_of_solids_pass_the_check_of_gradients(at):
-    """Where a paddle is at each step, over two segments, in both modes; and by a problem."""
-    from jax.test_util import check_grads
-
-    def end(places, turns):
-        state = at.state
-        for k in range(2):
-            path = {PATH: places[k], "paddle.turn": turns[k]}
-            state = at.layer.step(at.simulation, state, path, steps=3)
-        return 10.0 * state["velocities"]
-
-    random = np.random.default_rng(1)
-    places = at.np.asarray(np.cumsum(random.uniform(-0.01, 0.0, (6, 2)), axis=0).reshape(2, 3, 2))
-    turns = at.np.asarray(np.cumsum(random.uniform(0.0, 0.02, 6)).reshape(2, 3))
-    check_grads(end, (places, turns), order=1, modes=["fwd", "rev"], eps=1e-7)
-    gradient = at.jax.grad(lambda *own: (end(*own) ** 2).sum(), argnums=(0, 1))(places, turns)
-    assert all(np.abs(one).max() > 1e-3 for one in gradient)

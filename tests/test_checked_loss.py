@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from bad_scenes import one_sentence
-from cortado.device.precision import FLOAT32, FLOAT64
+from cortado.device.precision import FLOAT64
 from cortado.losses import FinalPositions, Frames, Recorded, Snapshot, SnapshotAdjoint, fingerprint
 from cortado.losses.run_losses import as_loss
 from cortado.particles.state import POSITIONS, VELOCITIES, Layout, State
@@ -25,8 +25,6 @@ END = Snapshot(state(), 2, np.zeros((PHASES, 3)))
 
 
 class Given:
-    """A loss that returns what it is given."""
-
     def __init__(self, value=1.0, adjoint=None):
         self._value, self._adjoint = value, adjoint
 
@@ -38,19 +36,7 @@ class Given:
 
 
 def adjoint_of(given):
-    """What becomes of the adjoint that a loss returns."""
     return as_loss(Given(adjoint=given)).value_and_adjoint(END)[1]
-
-
-class Narrow(Given):
-    def adjoint(self):
-        return None
-
-
-@pytest.mark.parametrize("value", [2, 2.0, np.float32(2.0), np.array(2.0)])
-def test_a_value_is_a_number(value):
-    found = as_loss(Given(value)).value(END)
-    assert type(found) is float and found == 2.0
 
 
 def test_adjoints_of_every_form_come_through():
@@ -67,10 +53,10 @@ def test_adjoints_of_every_form_come_through():
     assert found.value_and_adjoint(END)[1].state is bar
 
 
-@pytest.mark.parametrize("name", ["positions", "velocities", "mass_fractions"])
-def test_what_a_loss_is_given_cannot_be_changed(name):
-    with pytest.raises(ValueError, match="read-only"):
-        getattr(END, name)[:] = 1.0
+def test_what_a_loss_is_given_cannot_be_changed():
+    for name in ("positions", "velocities", "mass_fractions"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(END, name)[:] = 1.0
 
 
 def a_pair(positions, velocities=None):
@@ -83,15 +69,12 @@ WARPED = r"is a Warp array of vec3d of shape \(6,\) on cpu, but must be .* \(5,\
 OF_END = r"takes the arguments '\(end\)', but .* is an object with value\(end\) and adjoint\(end\)\.$"
 BAD_ADJOINTS = {
     "an adjoint that is not finite": (a_pair(LOST), r"positions has a value in row 1 .* must be made of numbers\.$"),
-    "one of a quantity": ({"velocities": np.full((N, 2), np.inf)}, "of velocities has a value in row 0"),
     "no adjoint": (None, "is a NoneType"),
-    "one array": (ONES, "is a ndarray"),
     "one array in a tuple": ((ONES,), "is a tuple of 1"),
     "a wrong shape": (a_pair(np.ones((N, 3))), r"of positions has shape \(5, 3\), but must be \(5, 2\)"),
     "complex numbers": (a_pair(ONES, ONES.astype(complex)), "of velocities is made of complex numbers"),
     "a mask": (a_pair(np.ma.masked_equal(0.0 * ONES, 0.0)), "of positions is partly masked"),
     "another number of particles": (state(N + 1), f"of positions {WARPED}"),
-    "another precision": (state(precision=FLOAT32), "of vec3f"),
     "NumPy arrays in a state": (
         State(END.state.fields, {**state().named(), "velocities": np.zeros((N, 3))}),
         "of velocities is a ndarray",
@@ -105,12 +88,9 @@ MISTAKES = {
     "a complex value": (lambda: as_loss(Given(1j)).value(END), "the loss's value is 1j"),
     **{name: (partial(adjoint_of, given), words) for name, (given, words) in BAD_ADJOINTS.items()},
     "a class": (lambda: as_loss(FinalPositions), "loss is the class FinalPositions"),
-    "an array": (lambda: as_loss(np.zeros((N, 2))), "loss is a ndarray"),
     "too few arguments": (lambda: as_loss(lambda x, v: None), r"takes the arguments '\(x, v\)', but must take 3"),
     "a function of the end": (lambda: as_loss(lambda end: 0.0), OF_END),
-    "too many arguments": (lambda: as_loss(lambda x, v, c, loss: None), "must take 3: positions, velocities"),
     "a function that is recorded": (lambda: Recorded(lambda x, v: None), r"arguments '\(x, v\)', but must take 3: pos"),
-    "an adjoint without an argument": (lambda: as_loss(Narrow()), "the loss's adjoint takes the arguments"),
     "frames that are a list": (lambda: Frames([Given()]), "losses is .* but must be a table"),
 }
 
@@ -120,21 +100,6 @@ def test_a_mistake_is_a_sentence(mistake, words):
     with one_sentence(words) as caught:
         mistake()
     assert len(str(caught.value)) < 300
-
-
-def test_a_function_whose_arguments_cannot_be_told_is_taken():
-    class Opaque:
-        __signature__ = "none"
-
-        def __call__(self, *arrays):
-            arrays[2].fill_(3.0)
-
-    assert as_loss(Opaque()).value(END) == 3.0
-
-
-def test_a_function_of_warp_arrays_is_taken():
-    assert as_loss(lambda x, v, loss: loss.fill_(float(len(x)))).value(END) == N
-    assert isinstance(END.state.positions, wp.array)
 
 
 GAIN = 2.0
@@ -180,21 +145,12 @@ class Settings:
         return 2.0 * self.gain
 
 
-@pytest.mark.parametrize("reads_by_method", [False, True])
-def test_what_a_loss_in_warp_reads_of_an_object_tells_it_too(reads_by_method):
-    def made(gain):
-        settings = Settings(gain)
-        by_method = lambda positions, velocities, loss: settings.twice()  # noqa: E731
-        return by_method if reads_by_method else lambda positions, velocities, loss: settings.gain
-
-    assert fingerprint(made(1.0)) == fingerprint(made(1.0)) != fingerprint(made(2.0))
-
-
 @pytest.mark.parametrize(
     "made",
     [
         lambda k: partial(lambda x, v, loss, k: None, k=k),
         lambda k: SimpleNamespace(k=k),
+        lambda k: Settings(k).twice,
         lambda k: {"inner": {"k": k}},
         lambda k: cache(lambda: k),
         lambda k: MethodType(lambda self: k, 1.0),

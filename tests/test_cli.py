@@ -4,15 +4,9 @@ import errno
 import json
 import os
 import re
-import shutil
-import signal
-import subprocess
-import sys
-import time
 from contextlib import contextmanager
 from dataclasses import replace
 from html import unescape
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -21,30 +15,24 @@ import pytest
 import cortado.cli.optimise
 import cortado.cli.run
 import cortado.files.vtkhdf
-from bad_scenes import BAD_SCENES, GOOD_SCENE, assert_one_sentence, assert_refused
-from bad_tasks import BAD_TASKS, GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
+from bad_scenes import assert_one_sentence, assert_refused
+from bad_tasks import GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.disk import locked
 from cortado.optimisation.solved_task import TaskFigures
 from cortado.optimisation.task_files import load_task
 from cortado.optimisation.transforms import TimeInterpolation
-from cortado.pictures.image_files import heart, rosetta, write_picture
 from cortado.runs.run_folder import FIGURES
 from full_disk import largest_file
 
 ALWAYS = {"scene.json", "environment.json", "metrics.jsonl", "figures", "report.html", "result.json"}
-BAD = [("run", "scene.toml", GOOD_SCENE, bad) for bad in BAD_SCENES[::8]]
-BAD += [("optimise", "task.toml", GOOD_TASK, bad) for bad in BAD_TASKS[::8]]
-"""Some of the bad ones, all of which tests/test_scene.py and tests/test_task.py have."""
 RUN_FILES, OPTIMISE_FILES = {*ALWAYS, "trajectory.vtkhdf"}, {*ALWAYS, "checkpoint"}
-COMMANDS = pytest.mark.parametrize(
-    "command", [["run", "scene.toml"], ["optimise", "task.toml"]], ids=["run", "optimise"]
-)
+BOTH = [["run", "scene.toml"], ["optimise", "task.toml"]]
+COMMANDS = pytest.mark.parametrize("command", BOTH, ids=["run", "optimise"])
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch, unrendered):
-    """A working directory with a scene and a task."""
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     (tmp_path / "task.toml").write_text(GOOD_TASK)
     monkeypatch.chdir(tmp_path)
@@ -56,24 +44,16 @@ def folder(tmp_path, monkeypatch, unrendered):
 
 @pytest.fixture
 def run(cortado_command):
-    """`cortado run` of the scene into a folder."""
     return lambda *more, out="dam": cortado_command("run", "scene.toml", "--out", out, *more)
 
 
 @pytest.fixture
 def optimise(cortado_command):
-    """`cortado optimise` of the task into a folder."""
     return lambda *more, out="found": cortado_command("optimise", "task.toml", "--out", out, *more)
 
 
-def sets(*overrides):
-    return [word for override in overrides for word in ("--set", override)]
-
-
-def start(*arguments):
-    """A command in a process of its own."""
-    command = [sys.executable, "-m", "cortado", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def sets(*overrides, prefix=""):
+    return [word for override in overrides for word in ("--set", prefix + override)]
 
 
 def assert_nothing_made(folder):
@@ -92,7 +72,6 @@ def metrics(run):
     return [json.loads(line) for line in (Path(run) / "metrics.jsonl").read_text().splitlines()]
 
 
-# ---- run ---------------------------------------------------------------------------------------------------------
 @pytest.mark.usefixtures("rendered")
 def test_run_writes_its_folder(run, folder):
     code, out, err = run("--steps", 4)
@@ -130,25 +109,6 @@ def test_an_earlier_run_is_kept_unless_overwritten_and_other_files_are_never(run
     assert_refused(run("--overwrite", out="."), "no run of Cortado")
     assert_refused(run(out="task.toml"), "cannot be written")
     assert Path("task.toml").read_text() == GOOD_TASK
-
-
-def test_a_path_need_not_be_utf_8(cortado_command, folder):
-    place = os.fsdecode(bytes(folder) + b"/\xff\x1b")
-    os.mkdir(place)
-    shutil.copy("scene.toml", place)
-    code, out, _ = cortado_command("run", f"{place}/scene.toml", "--steps", 2, "--out", f"{place}/dam")
-    assert code == 0 and f"{folder}/\\xff\\x1b/dam" in out
-    assert set(os.listdir(f"{place}/dam")) == RUN_FILES
-
-
-def test_one_frame_at_either_end_is_recorded_if_no_other_is(run):
-    code, _, err = run("--steps", 3, "--record-every", 10**17)
-    assert (code, Trajectory.load("dam/trajectory.vtkhdf").steps.tolist()) == (0, [0, 3]), err
-
-
-def test_steps_that_did_not_converge_are_mentioned(run):
-    code, _, err = run("--steps", 30, *sets("solver.maximum_iterations=4", "solver.density_tolerance=0"))
-    assert code == 0 and err.startswith("Warning: the pressure did not converge in ") and len(err.splitlines()) == 1
 
 
 @pytest.mark.usefixtures("rendered")
@@ -208,7 +168,6 @@ def test_an_interrupt_while_pictures_are_drawn_leaves_the_run_whole(run, monkeyp
 
 
 def test_how_far_a_run_is_that_ends_at_a_time_is_told_in_percent(run, monkeypatch):
-    """As nobody knows how many steps it takes where these are chosen."""
     told = []
 
     @contextmanager
@@ -229,60 +188,33 @@ def test_an_interrupt_before_anything_is_there_promises_nothing(cortado_command,
     assert cortado_command(*command, "--out", "dam") == (130, "", "Interrupted.\n")
 
 
-# ---- wrong input -------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("line", "words"),
     [
         ("--steps 3", "--steps is "),
         ("walk", "walk is unknown, but must be one of gradients, new, "),
         ("rnu scene.toml", "rnu is unknown; run may be meant"),
-        ("run scene", "scene: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
         ("run secne.toml", "secne.toml: the scene cannot be read: No such file or directory; did you mean scene.toml?"),
-        ("run", "SCENE.toml is missing; see cortado run --help."),
         ("gradients", "a command is missing, one of check; see cortado gradients --help."),
         ("run scene.toml --steps 0", "steps is 0"),
-        ("run scene.toml --steps -3", "steps is -3"),
         ("run scene.toml --record-every 0", "--record-every is 0"),
-        ("run scene.toml --record-every -2", "--record-every is -2"),
-        ("run scene.toml --device tpu", "device is 'tpu'"),
         ("run scene.toml --device cuda:99", "device is 'cuda:99'"),
         (f"run scene.toml --device {5000 * 'a'}", "aaa..., but must be one of"),
         ("run scene.toml --precision float16", "precision is 'float16'"),
-        ("run scene.toml --set solver.time_step", "not an override"),
         ("run scene.toml --set solver.timestep=0.1", "did you mean time_step?"),
-        ("run absent.toml", "absent.toml: the scene cannot be read"),
         ("run .", "cannot be read"),
-        ("run scene.toml --steps many", "--steps is 'many', but must be a whole number; see cortado run "),
+        ("run scene.toml --set phase.0.rest_density=0", "phase[0].rest_density"),
+        ("optimise task.toml --set problem.steps=-1", "problem.steps"),
         ("run scene.toml --time -1", "--time is -1, but must be a number of seconds greater than 0."),
-        ("run scene.toml --time nan", "--time is nan, but must be a number of seconds greater than 0."),
-        ("run scene.toml --time inf", "--time is inf, but must be a number of seconds greater than 0."),
-        ("run scene.toml --time soon", "--time is 'soon', but must be a number"),
         ("run scene.toml --time 1 --steps 3", "--time is given, but must be left out, as --steps says how long"),
         ("run scene.toml --steps", "--steps is given without a value"),
-        ("run scene.toml --stesp 3", "--stesp is unknown; --steps may be meant"),
-        ("run scene.toml --no", "--no is unknown"),
-        ("run scene.toml other.toml", "other.toml is unknown, or one too many"),
         ("run scene.toml --seed 3", "--seed is no option here; see cortado run --help."),
         ("gradients check scene.toml --perturbation x", "--perturbation is 'x', but must be a number"),
         ("run scene.toml --set name=\udcff", "must be text in UTF-8"),
-        ("optimise absent.toml --out found", "cannot be read"),
-        ("optimise task.toml --resume --out found", "no run"),
         ("optimise task.toml --resume --overwrite --out found", "exclude each other"),
-        ("optimise task.toml --precision double --out found", "precision is 'double'"),
-        ("gradients check scene.toml --steps 0", "steps is 0"),
-        ("gradients check scene.toml --seed -1", "--seed is -1"),
         ("gradients check scene.toml --loss sum", "--loss is 'sum', but must be one of positions, "),
-        ("gradients check scene.toml --parameters g", "parameter 'g' is unknown, but must be one of"),
-        ("gradients check scene.toml --perturbation -1", "perturbation is -1.0, but must be greater"),
-        ("gradients check scene.toml --out scene.toml", "scene.toml cannot be written: File exists"),
-        ("gradients check absent.toml", "cannot be read"),
-        ("examples --to there", "--to is given, but must be left out"),
         ("picture run --film --frame 1", "--frame is given, but must be left out"),
-        ("picture run --set picture.film_speed=1", "--set picture.film_speed is given, but must be left out"),
-        ("picture run --lines 90 --set picture.width=90", "picture.width is given, but must be left out"),
-        ("export run --to ply --set picture.width=90", "--set is picture.width=90, but must replace"),
         ("run scene.toml --set optimise.iterations=5", "optimise.iterations is given, but must be left out"),
-        ("describe scene.toml --set fit.starts=3", "fit.starts is given, but must be left out, as the table"),
     ],
 )
 def test_wrong_usage_is_refused(cortado_command, folder, line, words):
@@ -290,14 +222,6 @@ def test_wrong_usage_is_refused(cortado_command, folder, line, words):
     assert_nothing_made(folder)
 
 
-def test_a_process_of_its_own_says_no_more_than_the_sentence(folder):
-    process = start("run", "scene.toml", "--steps", "0", "--out", "dam")
-    out, err = process.communicate(timeout=60)
-    assert_refused((process.returncode, out, err), "steps is 0")
-    assert_nothing_made(folder)
-
-
-# ---- optimise ----------------------------------------------------------------------------------------------------
 @pytest.mark.usefixtures("rendered")
 def test_optimise_writes_its_folder(optimise, folder):
     code, out, err = optimise()
@@ -330,18 +254,6 @@ def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, 
 
 
 @pytest.mark.parametrize(
-    ("steps", "estimator", "told"), [(100, "exact", True), (99, "exact", False), (100, "adjoint_viscosity", False)]
-)
-def test_a_search_of_a_long_run_that_comes_to_nothing_says_what_to_try(optimise, steps, estimator, told):
-    short = sets(f"problem.steps={steps}", f"optimise.gradient.name={estimator}", "optimise.iterations=1")
-    code, out, _ = optimise("--no-pictures", *short, *sets("optimise.learning_rate=1e-9"))
-    assert code == 1 and ("The loss hardly fell. Over 100 steps the exact gradient may mean nothing" in out) is told
-    report = Path("found/report.html").read_text()
-    assert ("The loss hardly fell. Over 100 steps" in report) is told
-    assert ("The loss hardly fell: try an optimise.learning_rate that is 10 times as large" in report) is not told
-
-
-@pytest.mark.parametrize(
     ("change", "settings", "told"),
     [
         ({"misled": True}, [], "The gradient disagrees with what steps of the search did. Over 20 steps the exact"),
@@ -362,43 +274,23 @@ def test_a_search_that_cannot_be_trusted_says_what_to_try(optimise, monkeypatch,
         assert "line_search" not in out
 
 
-@pytest.mark.usefixtures("rendered")
-def test_a_search_that_ends_on_its_bounds_says_so(optimise):
-    bounds = sets("optimise.bounds.gravity=[[0.9,-9.9],[1.0,-9.7]]", "optimise.start.gravity=[0.95,-9.8]")
-    _, out, _ = optimise("--no-pictures", *bounds)
-    assert "The search of gravity ended on its bounds: what is best may lie beyond them." in out
-
-
 @pytest.mark.parametrize(
-    ("text", "hard", "begin", "words"),
+    ("text", "hard", "words"),
     [
-        (
-            GOOD_TASK,
-            ["loss_reduction=1e9", "parameter_error=1e-9"],
-            "",
-            "asks for 1e+09 times. The parameter gravity is ",
-        ),
-        (PLANE_PICTURE, ["psnr=80"], "The image is matched to ", " dB, but the task asks for 80 dB. "),
+        (GOOD_TASK, ["loss_reduction=1e9", "parameter_error=1e-9"], "asks for 1e+09 times. The parameter gravity is "),
+        (PLANE_PICTURE, ["psnr=80"], " dB, but the task asks for 80 dB. "),
     ],
     ids=["parameters", "images"],
 )
-def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(optimise, text, hard, begin, words):
+def test_an_optimisation_that_falls_short_fails_and_keeps_its_files(optimise, text, hard, words):
     Path("task.toml").write_text(text)
-    code, out, err = optimise(*sets(*(f"optimise.check.{one}" for one in hard)))
+    code, out, err = optimise(*sets(*hard, prefix="optimise.check."))
     assert (code, len(err.splitlines())) == (1, 1) and out.startswith("The loss fell ")
-    assert err.startswith(begin) and words in err and err.endswith("found.\n")
+    assert words in err and err.endswith("found.\n")
     assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
 
 
-def test_an_optimisation_that_diverges_says_so(optimise):
-    code, out, err = optimise(*sets("optimise.learning_rate=1e30"))
-    assert (code, out) == (1, "") and "a smaller learning rate" in err
-    assert_one_sentence(err.removesuffix("\n"))
-    assert len(metrics("found")) == 1
-
-
 def test_a_search_goes_on_past_runs_that_diverge_and_says_so(optimise):
-    """Also where it is resumed, with the same bits."""
     far = ["--no-pictures", *sets("optimise.learning_rate=1e4")]
     code, out, _ = optimise(*far)
     optimise(*far, *sets("optimise.iterations=1"), out="part")
@@ -414,24 +306,7 @@ def test_a_search_goes_on_past_runs_that_diverge_and_says_so(optimise):
         assert Path("part", file).read_bytes() == Path("found", file).read_bytes()
 
 
-@pytest.mark.parametrize("optimiser", ["lbfgs", "adam"])
-def test_progress_counts_updates_and_not_evaluations(optimise, monkeypatch, optimiser):
-    shown = []
-
-    @contextmanager
-    def track(total, description):
-        yield lambda n=1, **fields: shown.append((n, fields))
-        assert total == 8
-
-    monkeypatch.setattr("cortado.cli.optimise.track", track)
-    assert optimise(*sets(f"optimise.optimiser={optimiser}", "optimise.iterations=8"))[0] == 0
-    assert all(n in (0, 1) for n, _ in shown) and sum(n for n, _ in shown) == 8
-    last = [fields["evaluations"] for _, fields in shown if fields][-1]
-    assert last == len(metrics("found")) and (last > 9 if optimiser == "lbfgs" else last == 9)
-
-
 def test_a_bad_target_is_named(optimise, folder):
-    """One beyond the precision, and one that diverges."""
     result = optimise(*sets("problem.target.gravity=[0,-1e30]"))
     assert_refused(result, "problem.target: parameter gravity has a value of size 1e+30")
     code, out, err = optimise(*sets("problem.target.gravity=[0,-1e6]"))
@@ -440,41 +315,7 @@ def test_a_bad_target_is_named(optimise, folder):
     assert_nothing_made(folder)
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["optimise.start.gravity=[[0,-7],[0,-7],[0,-7],[0,-7],[0,-7]]"],
-        ["problem.target.gravity=[[0,-9],[0,-8],[0,-7],[0,-6],[0,-5]]"],
-        ["problem.target.viscosity=0.3", "optimise.start.viscosity=0.1", "optimise.optimiser=lbfgs"],
-    ],
-    ids=["start over time", "target over time", "two parameters"],
-)
-@pytest.mark.usefixtures("rendered")
-def test_other_parameters_are_optimised_and_drawn(optimise, overrides):
-    easy = ["optimise.check.loss_reduction=1", "optimise.check.parameter_error=100", "optimise.iterations=2"]
-    code, _, err = optimise(*sets(*overrides, *easy))
-    assert (code, err) == (0, "")
-    assert "gravity.png" in figures("found")
-
-
-@pytest.mark.parametrize("command, file, good, bad", BAD, ids=lambda one: one[0] if isinstance(one, tuple) else "")
-def test_a_bad_file_is_refused(cortado_command, folder, command, file, good, bad):
-    _, old, new, field = bad
-    Path(file).write_text(good.replace(old, new, 1))
-    assert_refused(cortado_command(command, file, "--out", "found"), f"{file}: ", field)
-    assert_nothing_made(folder)
-
-
-# ---- resume ------------------------------------------------------------------------------------------------------
 LONG = sets("optimise.iterations=60", "problem.steps=20")
-
-
-def wait_for_metrics(run, lines, process):
-    """Until so many evaluations are in the folder."""
-    path, end = Path(run) / "metrics.jsonl", time.monotonic() + 60.0
-    while not path.exists() or path.read_bytes().count(b"\n") < lines:
-        assert process.poll() is None and time.monotonic() < end
-        time.sleep(0.002)
 
 
 def assert_same_optimisation(one, other):
@@ -482,60 +323,37 @@ def assert_same_optimisation(one, other):
         assert (Path(one) / name).read_bytes() == (Path(other) / name).read_bytes()
 
 
-def test_a_killed_optimisation_resumes_bit_for_bit(optimise):
-    process = start("optimise", "task.toml", *LONG, "--out", "killed")
-    wait_for_metrics("killed", 10, process)
-    process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL and 10 <= len(metrics("killed")) < 61
-    assert_refused(optimise(*LONG, out="killed"), "--resume")
-    code, resumed, _ = optimise(*LONG, "--resume", out="killed")
-    assert code == 0
-    _, whole, _ = optimise(*LONG, out="whole")
-    first, *found, _ = resumed.splitlines()
-    updates = result_of("killed")["evaluations"]
-    assert re.fullmatch(r"The search goes on from iteration (9|\d\d) of 60, after \d\d evaluations\.", first), first
-    assert found == whole.splitlines()[:-1] and updates == 61
-    assert len(metrics("whole")) == 61
-    assert_same_optimisation("killed", "whole")
-    assert len(json.loads(Path("killed/environment.json").read_text())["resumed"]) == 1
-
-
 SMOOTHED = ["name=adjoint_viscosity", "coefficient=3.0", "samples=4", "spread.gravity=0.1", "position_noise=0.001"]
 
 
-def assert_goes_on(optimise, monkeypatch, after, *options):
-    """Interrupted after so many updates, a search ends where one does that is not."""
-    with monkeypatch.context() as patch:
-        patch.setattr(cortado.cli.optimise, "track", interrupting(after=after))
-        assert optimise(*options, out="stopped")[0] == 130
-    assert len(metrics("stopped")) == after + 1
-    assert optimise(*options, "--resume", out="stopped")[0] == 0
-    optimise(*options, out="whole")
-    assert_same_optimisation("stopped", "whole")
-
-
 @pytest.mark.parametrize(
-    "estimator", [[], ["name=adjoint_viscosity"], SMOOTHED], ids=["exact", "smoothing", "averaged"]
+    "text, estimator", [(GOOD_TASK, []), (GOOD_TASK, SMOOTHED), (TINY_LATTE, [])], ids=["exact", "averaged", "images"]
 )
-def test_an_interrupted_optimisation_resumes_bit_for_bit(optimise, monkeypatch, estimator):
-    options = ["check.loss_reduction=1", "check.parameter_error=100", *(f"gradient.{one}" for one in estimator)]
-    assert_goes_on(optimise, monkeypatch, 3, *sets(*(f"optimise.{one}" for one in options)))
+def test_an_interrupted_optimisation_resumes_bit_for_bit(optimise, monkeypatch, text, estimator):
+    Path("task.toml").write_text(text)
+    options = sets("check={}", *(f"gradient.{one}" for one in estimator), prefix="optimise.")
+    with monkeypatch.context() as patch:
+        patch.setattr(cortado.cli.optimise, "track", interrupting(after=1))
+        assert optimise(*options, out="stopped")[0] == 130
+    assert len(metrics("stopped")) == 2
+    assert_refused(optimise(*options, out="stopped"), "--resume")
+    code, resumed, _ = optimise(*options, "--resume", out="stopped")
+    first, *found, _ = resumed.splitlines()
+    _, whole, _ = optimise(*options, out="whole")
+    assert code == 0 and first.startswith("The search goes on from iteration ") and found == whole.splitlines()[:-1]
+    assert_same_optimisation("stopped", "whole")
+    assert len(json.loads(Path("stopped/environment.json").read_text())["resumed"]) == 1
 
 
 @pytest.mark.parametrize(
     ("text", "override", "words"),
     [
         (GOOD_TASK, "solver.time_step=0.002", "is now given solver.time_step = 0.002"),
-        (GOOD_TASK, "optimise.learning_rate=0.4", "begun with optimise.learning_rate = 0.5 and is now given"),
-        (GOOD_TASK, "optimise.optimiser=lbfgs", "optimise.optimiser = 'lbfgs'"),
         (GOOD_TASK, "optimise.start.gravity=[0,-6]", "is now given optimise.start.gravity = [0.0, -6.0]"),
-        (GOOD_TASK, "problem.target.gravity=[1,-9]", "is now given problem.target.gravity = [1.0, -9.0]"),
-        (GOOD_TASK, "problem.steps=6", "is now given problem.steps = 6"),
         (PLANE_PICTURE, "problem.picture=rosetta", "is now given problem.picture = "),
         (TINY_LATTE, "optimise.knots=2", "is now given optimise.knots = "),
     ],
-    ids=["step", "rate", "optimiser", "start", "target", "steps", "picture", "knots"],
+    ids=["step", "start", "picture", "knots"],
 )
 def test_a_changed_task_is_not_resumed(optimise, text, override, words):
     Path("task.toml").write_text(text)
@@ -546,17 +364,10 @@ def test_a_changed_task_is_not_resumed(optimise, text, override, words):
     assert len(before) == 2 and metrics("found") == before
 
 
-def test_another_precision_or_picture_is_not_resumed(optimise):
+def test_another_precision_is_not_resumed(optimise):
     optimise(*sets("optimise.iterations=1"))
     again = optimise("--resume", "--precision", "float64")
     assert_refused(again, "precision = 'float32' and is now given precision = 'float64'")
-    Path("task.toml").write_text(PLANE_PICTURE)
-    for draw, options, code in ((heart, sets("optimise.check={}"), 0), (rosetta, ["--resume"], 2)):
-        write_picture("a.png", draw((20, 16)))
-        result = optimise(*sets("problem.picture=a.png", "optimise.iterations=1"), *options, out="drawn")
-        assert result[0] == code, result
-    assert_refused(result, "problem = target and loss ")
-    assert "steps" not in result[2]
 
 
 def test_run_and_optimise_do_not_go_on_with_each_other(run, optimise):
@@ -575,18 +386,7 @@ def test_a_folder_that_is_being_written_is_refused(cortado_command, command):
     assert_refused(cortado_command(*command, "--out", "scene.toml"), "cannot be written")
 
 
-@pytest.mark.parametrize("size", [400, 2000, 20_000])
-@pytest.mark.usefixtures("rendered")
-def test_a_run_on_a_full_disk_says_so(run, size):
-    with largest_file(size):
-        code, out, err = run("--steps", 20, "--overwrite")
-    assert (code, out) == (1, "")
-    assert_one_sentence(err.removesuffix("\n"))
-    assert "cannot be written: File too large" in err
-    assert run("--steps", 20, "--overwrite")[0] == 0
-
-
-@pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "particles.png", "run.mp4", "report.html"])
+@pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "run.mp4", "report.html"])
 def test_frames_stay_when_a_disk_fills_up(run, monkeypatch, full):
     Path("scene.toml").write_text(TINY_LATTE.partition("[problem]")[0])
     replace, write = os.replace, cortado.files.vtkhdf.write_fully
@@ -613,7 +413,7 @@ def refuse():
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.parametrize("size", [400, 2500, 3500])
+@pytest.mark.parametrize("size", [400, 3500])
 def test_a_search_on_a_full_disk_says_so_and_goes_on(optimise, size):
     with largest_file(size):
         code, out, err = optimise(*LONG, out="full")
@@ -628,40 +428,11 @@ def test_a_search_on_a_full_disk_says_so_and_goes_on(optimise, size):
     assert_same_optimisation("full", "whole")
 
 
-def test_a_finished_optimisation_goes_on(optimise):
-    code, _, _ = optimise()
-    assert (code, optimise("--resume", *sets("optimise.iterations=8"))[0]) == (0, 0)
-    assert [row["iteration"] for row in metrics("found")] == list(range(9))
-
-
-# ---- images ------------------------------------------------------------------------------------------------------
 def figures(run):
     """Names of the pictures, each of them one that is removed when the run is overwritten."""
     names = {path.name for path in (Path(run) / "figures").iterdir()}
     assert names <= set(FIGURES)
     return names
-
-
-def test_a_run_is_rendered_as_its_scene_asks(run, folder):
-    Path("scene.toml").write_text(TINY_LATTE)
-    code, _, err = run("--steps", 2, out="a")
-    assert code == 0, err
-    assert (folder / "a" / "figures" / "rendered.png").exists()
-    assert (folder / "a" / "figures" / "run.mp4").exists() == bool(find_spec("av"))
-    assert Trajectory.load(folder / "a" / "trajectory.vtkhdf").mass_fractions.shape[2] == 2
-
-
-@pytest.mark.usefixtures("rendered")
-def test_places_are_found_for_a_picture(optimise):
-    Path("task.toml").write_text(PLANE_PICTURE)
-    code, out, err = optimise()
-    assert (code, err) == (0, "") and "the image is matched to " in out
-    assert {path.name for path in Path("found").iterdir()} == OPTIMISE_FILES
-    assert figures("found") == {"loss.png", "images.png", "progress.png"}
-    page = Path("found/report.html").read_text()
-    assert page.count("<img") == 3 and "image, PSNR</th>" in page and "<video" not in page
-    losses = [row["loss"] for row in metrics("found")]
-    assert len(losses) == 5 and losses[-1] < losses[0]
 
 
 @pytest.mark.usefixtures("rendered")
@@ -678,65 +449,15 @@ def test_a_cup_is_swung_until_it_looks_as_it_should(optimise):
     for values, course in ((knots["estimate"], rows), (knots["true"], task.true_parameters["gravity"])):
         np.testing.assert_allclose(TimeInterpolation(len(course), 3).parameter(np.array(values)), course, rtol=1e-9)
     assert [f"  gravity at {time:.4g} s: " in out for time in knots["times"]] == [True] * 3
-    wanted = {"loss.png", "images.png", "progress.png", "gravity.png"}
-    assert figures("found") == wanted
+    assert figures("found") == {"loss.png", "images.png", "progress.png", "gravity.png"} and len(metrics("found")) == 4
     page = Path("found/report.html").read_text()
-    assert page.count("gravity at ") == 3
-    assert page.count("<img") == 4 and "<video" not in page
-    assert len(metrics("found")) == 4
+    assert page.count("gravity at ") == 3 and page.count("<img") == 4 and "<video" not in page
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        "problem.frames=3 problem.distance=pyramid",
-        "problem.target.colours=[[0.9,0.1,0.1],[0.1,0.9,0.1]] optimise.start={colours=[[0.5,0.5,0.5],[0.4,0.4,0.4]]}",
-        'problem.target.viscosity=[0.1,0.2] optimise.start.viscosity=[0.2,0.1] optimise.logarithmic=["viscosity"]',
-        "problem.target.mobility=2e-5 optimise.start={mobility=1e-5} optimise.learning_rate=2e-5",
-        "render.view=volume render.position=[0.05,0.05,0.05] render.look_at=[0,0.005,0]",
-    ],
-    ids=["frames", "colours", "factors", "a number", "a camera"],
-)
-def test_other_tasks_of_images(optimise, overrides):
-    has_rows = "optimise.start={" not in overrides
-    Path("task.toml").write_text(TINY_LATTE if has_rows else TINY_LATTE.replace("knots = 3", ""))
-    more = "optimise.iterations=1", "optimise.check.parameter_error=1e9"
-    code, _, err = optimise(*sets(*overrides.split(), *more))
-    assert (code, err) == (0, "") and figures("found") >= {"images.png", "progress.png"}
-
-
-@pytest.mark.usefixtures("rendered")
-def test_an_optimisation_of_images_resumes_bit_for_bit(optimise, monkeypatch):
-    Path("task.toml").write_text(TINY_LATTE)
-    assert_goes_on(optimise, monkeypatch, 1)
-    for name in ("images.png", "progress.png"):
-        one, whole = (Path(run) / "figures" / name for run in ("stopped", "whole"))
-        assert one.read_bytes() == whole.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("problem.picture=absent.png", "absent.png cannot be read"),
-        ("problem.picture=task.toml", "task.toml cannot be read"),
-        ("render.view=top", "render.view is 'top'"),
-        ("render.resolution=[4,4]", "render.resolution"),
-        ("optimise.bounds.initial_positions=[[0,0,0],[1,1,1]]", "optimise.bounds.initial_positions"),
-        ('container={shape="none"}', "has no container to fill"),
-    ],
-)
-def test_a_wrong_task_of_images_is_refused(optimise, folder, override, words):
-    Path("task.toml").write_text(PLANE_PICTURE)
-    assert_refused(optimise(*sets(override)), words)
-    assert_nothing_made(folder)
-
-
-# ---- gradients and bench -----------------------------------------------------------------------------------------
 def test_a_right_gradient_passes_the_check_in_words_and_in_json(cortado_command):
     code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3)
-    assert (code, err) == (0, "") and "64 particles, 3 steps" in out
-    rows = [line for line in out.splitlines() if line.rstrip(" │").endswith("right")]
-    assert len(rows) == 6 and "WRONG" not in out
+    assert (code, err) == (0, "") and "64 particles, 3 steps" in out and "WRONG" not in out
+    assert sum(line.rstrip(" │").endswith("right") for line in out.splitlines()) == 6
     assert "The adjoint is right: reverse and forward mode agree to 1" in out
     assert out.endswith("For 3 steps use gradients.Exact().\n")
     code, out, _ = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--json")
@@ -746,21 +467,17 @@ def test_a_right_gradient_passes_the_check_in_words_and_in_json(cortado_command)
     assert certificate["horizon"] == 3 and certificate["estimator"] == "Exact()"
 
 
-@pytest.mark.parametrize("loss", ["centre-of-mass", "image"])
 @pytest.mark.usefixtures("rendered")
-def test_the_check_writes_a_figure(cortado_command, folder, loss):
-    code, out, err = cortado_command(
-        *("gradients", "check", "scene.toml", "--steps", 2, "--loss", loss, "--out", "a/b"),
-        *("--parameters", "gravity", "initial_velocities"),
-    )
+def test_the_check_writes_a_figure(cortado_command, folder):
+    own = ("--loss", "image", "--out", "a/b", "--parameters", "gravity", "initial_velocities")
+    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 2, *own)
     assert (code, err) == (0, "") and out.splitlines()[-1] == f"The results are in {folder / 'a' / 'b'}"
     assert {path.name for path in Path("a/b").iterdir()} == {"certificate.png", "certificate.json"}
     assert json.loads(Path("a/b/certificate.json").read_text())["right"] is True
 
 
-@pytest.mark.parametrize("json_option", [[], ["--json"]])
 @pytest.mark.usefixtures("rendered")
-def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_option):
+def test_a_planted_error_fails_the_check(cortado_command, monkeypatch):
     right = Problem.estimate
 
     def wrong(self, *arguments, **options):
@@ -770,7 +487,7 @@ def test_a_planted_error_fails_the_check(cortado_command, monkeypatch, json_opti
         return found
 
     monkeypatch.setattr(Problem, "estimate", wrong)
-    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--out", "wrong", *json_option)
+    code, out, err = cortado_command("gradients", "check", "scene.toml", "--steps", 3, "--out", "wrong")
     assert Path("wrong/certificate.png").exists()
     assert (code, err) == (1, "The adjoint is wrong for: initial_velocities.\n")
-    assert json.loads(out)["right"] is False if json_option else out.count("WRONG") == 2
+    assert json.loads(Path("wrong/certificate.json").read_text())["right"] is False and out.count("WRONG") == 2

@@ -18,29 +18,22 @@ from cortado.particles.state import POSITIONS, VELOCITIES, Layout, to_device
 from cortado.scene.shape_tables import CylinderContainer
 from cortado.solvers.containment import Containment
 from cortado.solvers.obstacles import Walled
-from scenes import jet, plane, scene
+from scenes import bodies, jet, plane, scene
 
 SUPPORTS = {"cubic_spline": 2.0, "wendland_c2": 2.6, "wendland_c4": 3.0}
 
 
 def box(particles: int = 1000, kernel: str = "cubic_spline") -> Scene:
-    """The dam break of `python -m benchmarks bench`."""
     return _with_kernel(dam_break(particles).model_dump(mode="json"), kernel)
 
 
 def cup(kernel: str = "cubic_spline") -> Scene:
-    """1,008 particles that fall into a tilted cup with a lid."""
-    tables = {
-        "name": "cup",
-        "dimension": 3,
-        "discretisation": {"spacing": 0.1},
-        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.05}],
-        "fluid": [{"shape": "cylinder", "base": [0.0, 0.6, 0.0], "radius": 0.6, "height": 0.9, "phase": "water"}],
-        "container": {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.65, "height": 1.6, "lid": True},
-        "forces": {"gravity": [3.0, -9.81, 0.0]},
-        "solver": {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5},
-    }
-    return _with_kernel(tables, kernel)
+    """1,011 particles that fall into a tilted cup with a lid."""
+    water = {"shape": "cylinder", "base": [0.0, 0.6, 0.0], "radius": 0.6, "height": 0.9}
+    walls = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.65, "height": 1.6, "lid": True}
+    solver = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 5, "maximum_iterations": 5}
+    made = bodies(3, [water], walls, 0.1, 0.05, forces={"gravity": [3.0, -9.81, 0.0]}, solver=solver)
+    return _with_kernel(made.model_dump(mode="json"), kernel)
 
 
 def _with_kernel(tables: dict[str, Any], kernel: str) -> Scene:
@@ -49,7 +42,6 @@ def _with_kernel(tables: dict[str, Any], kernel: str) -> Scene:
 
 
 def escaped(scene: Scene, trajectory: Trajectory) -> int:
-    """How many times a particle was outside of the container at the end of a step."""
     everywhere = trajectory.positions.reshape(-1, trajectory.dimension)
     return int(np.count_nonzero(~scene.container.contains(everywhere.astype(np.float64), 0.0)))
 
@@ -67,7 +59,6 @@ def energies(scene: Scene, trajectory: Trajectory) -> np.ndarray:
 )
 @pytest.mark.parametrize("make", [box, cup])
 def test_walls_hold_a_dam_break(make, kernel, steps):
-    """1,000 particles."""
     scene = make(kernel=kernel)
     trajectory = Simulation(scene, precision="float32").run(steps)
     travelled = np.linalg.norm(trajectory.positions[-1] - trajectory.positions[0], axis=1)
@@ -78,24 +69,17 @@ def test_walls_hold_a_dam_break(make, kernel, steps):
     assert trajectory.density_errors[10:].max() <= 0.01
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("kernel", SUPPORTS)
 @pytest.mark.parametrize("round_walls", [False, True])
-def test_a_column_that_touches_walls_starts_with_no_more_than_its_energy(round_walls, kernel, precision):
+def test_a_column_that_touches_walls_starts_with_no_more_than_its_energy(round_walls, kernel):
     """In short steps whatever is compressed at first, at an edge or in a corner, would burst."""
     column = {"shape": "box", "lower": [0.0, 0.0, 0.0], "upper": [1.0, 1.0, 1.0]}
     in_a_cup = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 1.0}
-    tables = {
-        "dimension": 3,
-        "discretisation": {"spacing": 1.0 / 6.0},
-        "phase": [{"name": "water", "rest_density": 1000.0, "viscosity": 0.0}],
-        "fluid": [{**({**in_a_cup, "height": 1.0} if round_walls else column), "phase": "water"}],
-        "container": {**in_a_cup, "height": 1.5} if round_walls else {**column, "upper": [2.0, 2.0, 1.0]},
-        "forces": {"gravity": [0.0, -9.81, 0.0]},
-        "solver": {"kind": "pcisph", "time_step": 0.0005, "maximum_iterations": 100, "density_tolerance": 1e-4},
-    }
-    made = _with_kernel(tables, kernel)
-    energy = energies(made, Simulation(made, precision=precision).run(60))
+    fluid = {**in_a_cup, "height": 1.0} if round_walls else column
+    walls = {**in_a_cup, "height": 1.5} if round_walls else {**column, "upper": [2.0, 2.0, 1.0]}
+    solver = {"kind": "pcisph", "time_step": 0.0005, "maximum_iterations": 100, "density_tolerance": 1e-4}
+    made = _with_kernel(bodies(3, [fluid], walls, 1.0 / 6.0, solver=solver).model_dump(mode="json"), kernel)
+    energy = energies(made, Simulation(made).run(60))
     assert energy.max() <= 1.001 * energy[0]
 
 
@@ -169,12 +153,6 @@ def test_what_goes_over_the_rim_of_an_open_cup_may_fall_on():
     tables["container"] |= {"lid": False, "height": 0.6, "radius": 0.62}
     trajectory = Simulation(Scene(**{**tables, "forces": {"gravity": [9.0, -6.0, 0.0]}}), precision="float64").run(300)
     assert np.linalg.norm(trajectory.positions[-1][:, [0, 2]], axis=1).max() > 0.8  # some is spilled
-    tables = cup().model_dump(mode="json")
-    tables["container"] |= {"lid": False}
-    simulation = Simulation(Scene(**tables), precision="float32")
-    state = simulation.run(1).last_state
-    state["positions"][0] = [5.0, -2e4 * 0.1, 0.0]
-    assert simulation.run(2, state=state).positions[-1, 0, 1] <= -2e4 * 0.1
 
 
 def test_what_waits_in_a_nozzle_passes_walls_with_it():
@@ -194,21 +172,15 @@ def test_fluid_that_has_gone_round_a_period_may_be_where_it_is():
         problem.value({"initial_positions": simulation.positions - [0.0, 1.0]})
 
 
-@pytest.mark.parametrize("scale", [0.0, 0.001])
-def test_fluid_crowded_into_a_point_is_refused(scale):
-    simulation = Simulation(plane(), precision="float64")
-    problem = Problem(simulation, 1, losses.CentreOfMass([0.0, 0.0]))
-    middle = simulation.positions.mean(axis=0)
-    with pytest.raises(InputError, match=r"initial_positions has all particles within 0\.002\d* m2, but must leave"):
-        problem.value({"initial_positions": middle + scale * (simulation.positions - middle)})
-
-
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_parameters_that_cannot_be_are_refused():
     simulation = Simulation(plane(), precision="float64")
     problem = Problem(simulation, 20, losses.CentreOfMass([0.0, 0.0]))
     with pytest.raises(InputError, match=r"initial_positions has particle 0 at \(5.025, 0.025\) m, outside"):
         problem.value({"initial_positions": simulation.positions + [5.0, 0.0]})
+    middle = simulation.positions.mean(axis=0)
+    with pytest.raises(InputError, match=r"initial_positions has all particles within 0\.002\d* m2, but must leave"):
+        problem.value({"initial_positions": middle + 0.001 * (simulation.positions - middle)})
     with pytest.raises(InputError, match="rest_density has a value of size 1e"):
         problem.value_and_gradient({"rest_density": 1e300})
     for values in ({"gravity": [0.0, -1e4]}, {"time_step": 1.0}):
@@ -222,11 +194,6 @@ def test_a_time_step_beyond_the_limit_of_stability_is_warned_of_once():
     problem.value({"gravity": [0.0, -9.81], "time_step": 0.0021})
     with pytest.warns(CortadoWarning, match="time_step is 0.012 s, but the limit of stability with these"):
         problem.value({"time_step": 0.012})
-    problem.value({"time_step": 0.012})
-    shallow = plane(container={"shape": "box", "lower": [0.0, 0.0], "upper": [70.0, 0.8]})
-    aside = Problem(Simulation(shallow, precision="float64"), 2, losses.CentreOfMass([0.0, 0.0]))
-    with pytest.warns(CortadoWarning, match="limit of stability"):
-        aside.value({"tilt": [90.0]})
     with pytest.warns(CortadoWarning, match="limit of stability"):
         simulation.run(2, controls={"gravity": [[0.0, -9.81], [0.0, -400.0]]})
 
@@ -258,7 +225,6 @@ def test_particles_that_go_further_than_a_precision_resolves_are_lost():
 
 
 def points(tmp_path, apart):
-    """12 x 12 points in a scene of the spacing 0.05 m."""
     lattice = np.stack(np.meshgrid(*[apart * (np.arange(12) + 0.5)] * 2), axis=-1).reshape(-1, 2)
     np.save(tmp_path / "points.npy", lattice)
     return plane(
@@ -278,13 +244,3 @@ def test_points_fit_the_spacing_or_are_warned_of_or_refused(tmp_path):
         warnings.simplefilter("error", CortadoWarning)
         Simulation(points(tmp_path, 0.05))
         Simulation(points(tmp_path, 0.051))
-
-
-def test_points_that_overlap_a_body_are_told_of_both(tmp_path):
-    """A line of points where two boxes meet is a spacing apart, and nowhere nearer than half of one to the boxes."""
-    np.save(tmp_path / "points.npy", [[0.5, 0.05 * (k + 0.5)] for k in range(10)])
-    line = {"shape": "points", "file": str(tmp_path / "points.npy"), "phase": "water"}
-    box = {"shape": "box", "lower": [0.0, 0.0], "upper": [0.5, 0.5], "phase": "water"}
-    boxes = [box, {**box, "lower": [0.5, 0.0], "upper": [1.0, 0.5]}]
-    with pytest.raises(InputError, match=r"^fluid\[2\] is overlapping fluid\[0\] at \(0.5, .* 1.68 times the rest"):
-        Simulation(plane(fluid=[*boxes, line], container={"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0]}))

@@ -6,16 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bad_scenes import assert_one_sentence
+from bad_scenes import assert_refused
 from bad_tasks import TINY_SCENE
 from cortado.cli.compare import Extrapolation
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings
 
 
-@pytest.mark.parametrize("order", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("sizes", [[0.8, 0.4, 0.2, 0.1], [0.3, 0.2, 0.1], [0.1, 0.09, 0.07]])
-@pytest.mark.parametrize("scale", [1.0, -30.0])
+@pytest.mark.parametrize("order", [0.5, 2.0])
+@pytest.mark.parametrize("sizes, scale", [([0.8, 0.4, 0.2, 0.1], 1.0), ([0.1, 0.09, 0.07], -30.0)])
 def test_a_power_of_the_size_is_found(order, sizes, scale):
     found = Extrapolation.of(sizes, [7.0 + scale * h**order for h in sizes])
     assert found.order == pytest.approx(order, rel=1e-6) and found.limit == pytest.approx(7.0, rel=1e-7)
@@ -43,9 +42,7 @@ def test_the_example_of_celik_and_others():
     ("values", "words"),
     [
         ([1.0, 2.0, 1.5], "it goes up and down"),
-        ([1.0, 1.5, 2.0], "it does not come to rest"),
         ([1.0, 1.5, 3.0], "it does not come to rest"),
-        ([1.0, 1.0, 2.0], "it does not come to rest"),
         ([2.0, 1.0, 1.0], "the two finest are equal"),
         ([1.0, np.nan, 2.0], "not a number"),
         ([1e9, 1.0, 1.0 - 1e-9], "it has no order that can be told"),
@@ -85,7 +82,6 @@ def test_a_table_of_time_steps(cortado_command):
 
 @pytest.mark.usefixtures("scene")
 def test_what_drains_took_is_no_part_of_the_centre_of_mass(cortado_command):
-    """It rests metres away. What is left are the two columns of particles on the left."""
     Path("scene.toml").write_text(TINY_SCENE + '\n[[drain]]\nshape = "box"\nname = "side"\nlower = [0.2, 0.0]\n')
     assert cortado_command("sweep", "scene.toml", "--set", "solver.time_step=0.002,0.001,0.0005", "--steps", 4)[0] == 0
     table = json.loads(cortado_command("convergence", "runs/sweep", "--json")[1])
@@ -97,23 +93,17 @@ def test_what_drains_took_is_no_part_of_the_centre_of_mass(cortado_command):
 def test_a_number_of_ones_own_is_in_the_table(cortado_command, tmp_path):
     (tmp_path / "own.py").write_text(
         "def lowest(trajectory):\n    return trajectory.positions[-1, :, 1].min()\n\n\n"
-        "def bad(trajectory):\n    return trajectory.nothing\n\n\ndef rows(trajectory):\n    return [1.0, 2.0]\n"
+        "def rows(trajectory):\n    return [1.0, 2.0]\n"
     )
-    (tmp_path / "broken.py").write_text("def lowest(:\n")
     assert cortado_command("sweep", "scene.toml", "--set", "solver.time_step=0.002,0.001,0.0005", "--steps", 4)[0] == 0
     code, out, err = cortado_command("convergence", "runs/sweep", "--quantity", "own.py:lowest")
     assert (code, err) == (0, "") and any(line.startswith("lowest ") for line in out.splitlines())
     for given, words in (
-        ("own.py", "must be FILE.py:FUNCTION"),
         ("own.py:highest", "has no function highest"),
-        ("own.py:bad", "failed: AttributeError"),
         ("own.py:rows", "must return a number"),
-        ("broken.py:lowest", "cannot be read: SyntaxError"),
         ("none.py:lowest", "cannot be read: FileNotFoundError"),
     ):
-        code, out, err = cortado_command("convergence", "runs/sweep", "--quantity", given)
-        assert (code, out) == (2, "") and words in err
-        assert_one_sentence(err.removesuffix("\n"))
+        assert_refused(cortado_command("convergence", "runs/sweep", "--quantity", given), words)
 
 
 @pytest.mark.usefixtures("scene")
@@ -139,21 +129,17 @@ def test_runs_that_do_not_belong_together_are_refused(cortado_command):
         ("aab", "have the same solver.time_step"),
         ("aaa", "do not differ"),
     ):
-        code, out, err = cortado_command("convergence", *runs)
-        assert (code, out) == (2, "") and words in err, err
-        assert_one_sentence(err.removesuffix("\n"))
+        assert_refused(cortado_command("convergence", *runs), words)
     assert cortado_command("convergence", "nowhere", "a", "b")[0] == 2
 
 
 @pytest.fixture
 def recorded(tmp_path, monkeypatch):
-    """The folder of a run whose gauge has read 2 t."""
     monkeypatch.chdir(tmp_path)
     folder = RunFolder.create("run", "{}", ["cortado"])
     times = np.linspace(0.0, 1.0, 11)
-    folder.write_sensors(
-        {"gauge": Readings(times, np.stack([2 * times, 0 * times], axis=1), {"height": "m", "f": "N"})}
-    )
+    values = np.stack([2 * times, 0 * times], axis=1)
+    folder.write_sensors({"gauge": Readings(times, values, {"height": "m", "f": "N"})})
     return folder
 
 
@@ -163,8 +149,7 @@ def test_readings_come_back_bit_for_bit_and_what_is_missing_is_a_sentence(record
     np.testing.assert_array_equal(found["height"], 2 * np.linspace(0.0, 1.0, 11))
     assert "cannot be read" in cortado_command("compare", "run", "data.csv")[2]
     recorded.sensors.unlink()
-    code, _, err = cortado_command("compare", "run", "data.csv")
-    assert code == 2 and "has no sensors.csv" in err
+    assert_refused(cortado_command("compare", "run", "data.csv"), "has no sensors.csv")
 
 
 @pytest.mark.parametrize("head", ["time,gauge.height", "time [s], gauge.height [m]"])
@@ -184,18 +169,13 @@ def test_the_error_is_that_at_the_measured_times(recorded, cortado_command, head
     [
         ("time,gauge.depth\n0,1\n", "has the column 'gauge.depth', but must have some of gauge.height, gauge.f"),
         ("time,gauge.height [mm]\n0,1\n", "has gauge.height in mm, but must have it in m"),
-        ("time [ms],gauge.height\n0,1\n", "but must have time [s]"),
         ("gauge.height\n1\n", "but must have time [s], and some of gauge.height"),
-        ("time;gauge.height\n0,5;1\n", "has semicolons between its columns, but must have commas"),
         ("time\n1\n", "has only times"),
         ("time,gauge.height\n2,1\n", "has no value of gauge.height within the run"),
-        ("time,gauge.height\n0.1,x\n", "line 2, gauge.height is 'x'"),
         ("", "must have a line of different names"),
     ],
 )
 @pytest.mark.usefixtures("recorded")
 def test_tables_that_do_not_fit_are_sentences(cortado_command, text, words):
     Path("data.csv").write_text(text)
-    code, out, err = cortado_command("compare", "run", "data.csv")
-    assert (code, out) == (2, "") and words in err, err
-    assert_one_sentence(err.removesuffix("\n"))
+    assert_refused(cortado_command("compare", "run", "data.csv"), words)

@@ -83,7 +83,6 @@ CASES = [(command, option) for command, options in OPTIONS.items() for option in
 
 @pytest.fixture
 def effects(tmp_path, monkeypatch, cortado_command, unrendered):
-    """How a command ends in a folder that has only what it asks for, what it says, and what it leaves."""
     monkeypatch.chdir(tmp_path)
 
     def seen(command, *arguments):
@@ -107,7 +106,6 @@ def effects(tmp_path, monkeypatch, cortado_command, unrendered):
 
 
 def content(path):
-    """The numbers in a file, or the bits of a picture or a surface."""
     if path.suffix in (".png", ".vtp", ".ply", ".toml", ".py", ".webp"):
         return hashlib.sha256(path.read_bytes()).hexdigest()
     if path.suffix == ".vtkhdf":
@@ -125,7 +123,6 @@ def test_no_option_is_forgotten(command, cortado_command):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_given_twice_has_the_same_effects(command, effects):
-    """Or all options would act."""
     arguments = COMMANDS[command][0].split()
     found = effects(command, *arguments)
     assert found[0] in (0, 1), found
@@ -222,7 +219,6 @@ def test_no_key_of_a_task_is_forgotten():
 
 
 def written(folder, tables):
-    """A task in a folder, with what it reads beside it."""
     scene = TINY_SCENE.splitlines(keepends=True)
     file = folder / "task.toml"
     top = "".join(f"{name} = {toml(value)}\n" for name, value in tables.items())
@@ -238,7 +234,6 @@ def toml(value: Any) -> str:
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A folder with what was measured."""
     folder = tmp_path_factory.mktemp("measured")
     run = Simulation(load_scene(written(folder, {"sensor": [SENSOR], "render": RENDER}))).run(8)
     heights = run.sensors["gauge"].values
@@ -259,8 +254,6 @@ def measured(tmp_path_factory):
 
 @pytest.fixture
 def outcome(cortado_command, unrendered, measured, tmp_path_factory):
-    """What a command makes of tables: how it ends, what it says, and the numbers that it leaves."""
-
     def ended(base, tables):
         folder = tmp_path_factory.mktemp("task")
         for path in measured.iterdir():

@@ -21,7 +21,7 @@ from cortado.device import threads as calls
 from cortado.device.threads import usable_cores
 from cortado.errors import OutOfRangeError
 from cortado.executors import Distributed, InProcess, local_workers
-from cortado.gradients import EnsembleMean, Estimate, Exact, RandomizedSmoothing
+from cortado.gradients import EnsembleMean, Exact, RandomizedSmoothing
 from dask_processes import PATIENCE, scheduler
 from scenes import plane
 from work_for_workers import FarFromHome, SlowValue, gpu_and_process, process, square
@@ -57,11 +57,9 @@ def bits(estimate):
 
 
 def answer(function, number=0):
-    """What comes back from a worker that calls a function."""
     return calls.call(calls.Payload.of(function), calls.pickled(number, "The item"))
 
 
-# ---- in this process ---------------------------------------------------------------------------------------------
 def test_in_process_items_are_taken_one_after_the_other_as_they_are_needed_and_the_first_error_ends_it():
     told, taken, seen = [], [], []
     assert InProcess().map(square, iter(range(4)), lambda *pair: told.append(pair)) == [0, 1, 4, 9]
@@ -78,16 +76,9 @@ def test_in_process_items_are_taken_one_after_the_other_as_they_are_needed_and_t
     assert (caught.value.particle, seen) == (0, [0])
 
 
-# ---- errors and functions in transit -----------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "error",
-    [
-        DivergedError(5, 7, "try less", "went through a wall", 2),
-        cortado.SceneError("a.toml", "solver.time_step", -1.0, "greater than 0"),
-        InputError("This is wrong."),
-        ComputationError("This failed."),
-    ],
-    ids=lambda error: type(error).__name__,
+    [DivergedError(5, 7, "less", "went through", 2), cortado.SceneError("a.toml", "solver.time_step", -1.0, "above 0")],
 )
 def test_errors_arrive_as_themselves(error):
     def fail(_):
@@ -136,7 +127,6 @@ class Exits:
     ("function", "error", "words"),
     [
         (lambda _: sys.exit(3), ComputationError, r"^An item ended .* SystemExit: 3; what is .* not do so\.$"),
-        (lambda _: sys.exit(), ComputationError, r"^An item ended its process, by SystemExit; what is"),
         (lambda _: signal.default_int_handler(signal.SIGINT, None), ComputationError, "by KeyboardInterrupt; what is"),
         (lambda _: Exits(), ComputationError, "by SystemExit: 1; what is computed"),
         (lambda _: threading.Lock(), InputError, "The result cannot be sent to another process: TypeError"),
@@ -156,7 +146,6 @@ def test_an_executor_is_asked_for_by_its_type_and_is_no_part_of_what_an_estimato
     assert one == other and hash(one) == hash(other) and repr(one) == repr(other)
 
 
-# ---- two worker processes ----------------------------------------------------------------------------------------
 def test_estimators_have_the_bits_that_they_have_alone(problem, workers):
     for made in (RandomizedSmoothing(samples=2), EnsembleMean(estimator=Exact())):
         wanted = problem.estimate(POINTS[1], made)
@@ -194,7 +183,6 @@ class Loss:
 
 
 def test_a_loss_of_the_main_module_travels(problem, workers):
-    """As in a script, whose classes no other process can import."""
     namespace = {"__name__": "__main__"}
     exec(MAIN, namespace)
     own = Problem(problem.simulation, 2, namespace["Loss"]())
@@ -225,7 +213,6 @@ def test_the_error_of_the_first_item_that_has_one_is_raised(workers):
 @pytest.mark.parametrize("gradient", [None, Exact()])
 @pytest.mark.parametrize("where", ["here", "workers"])
 def test_what_diverges_is_nan_and_the_others_are_there(problem, request, gradient, where):
-    """Points that are launched together too."""
     executor = request.getfixturevalue("workers") if where == "workers" else InProcess()
     at_rest, far = (np.full_like(problem.simulation.positions, size) for size in (0.0, 1e5))
     points = [{"initial_velocities": velocities} for velocities in (at_rest, far, at_rest, far)]
@@ -245,7 +232,6 @@ def test_what_diverges_is_nan_and_the_others_are_there(problem, request, gradien
 @pytest.mark.filterwarnings("ignore:time_step is")
 @pytest.mark.parametrize("gradient", [None, Exact()])
 def test_what_is_out_of_range_is_treated_as_what_diverges(problem, gradient):
-    """A viscosity below 0, a number that is none, fluid outside; but a wrong name is a mistake."""
     first, far = problem.simulation.positions, np.full_like(problem.simulation.positions, 1e5)
     points = [{"viscosity": mu} for mu in (0.1, -0.1, np.nan)] + [{"initial_positions": first + 10.0}]
     words = r"^3 of 4 points cannot be run, and .* point 1: parameter viscosity is -0.1, but must be at least 0\.$"
@@ -253,10 +239,8 @@ def test_what_is_out_of_range_is_treated_as_what_diverges(problem, gradient):
         found = cortado.evaluate(problem, points, gradient)
     assert found[0].loss == problem.value(points[0]) and [np.isnan(one.loss) for one in found] == [False] + 3 * [True]
     assert all(isinstance(one.diverged, OutOfRangeError) for one in found[1:])
-    both = [points[0], points[1], {"initial_velocities": far}]
     with pytest.warns(CortadoWarning, match="^2 of 3 points diverged or cannot be run"):
-        cortado.evaluate(problem, both)
-    assert [one.loss for one in cortado.evaluate(problem, points[1:3], loss_if_diverged=np.inf)] == [np.inf, np.inf]
+        cortado.evaluate(problem, [*points[:2], {"initial_velocities": far}])
     with pytest.raises(InputError, match="parameter 'viscous' is unknown"):
         cortado.evaluate(problem, [*points, {"viscous": 0.1}])
 
@@ -264,8 +248,6 @@ def test_what_is_out_of_range_is_treated_as_what_diverges(problem, gradient):
 @pytest.mark.filterwarnings("ignore:time_step is")
 def test_where_no_point_has_a_run_the_first_error_is_raised_and_what_diverges_may_have_a_loss(problem, workers):
     far = {"initial_velocities": np.full_like(problem.simulation.positions, 1e5)}
-    with pytest.raises(DivergedError, match=r"^The simulation diverged in step 1: "):
-        cortado.evaluate(problem, [far, {"viscosity": -1.0}])
     with pytest.raises(InputError, match=r"^parameter viscosity is -1\.0, but must be at least 0\.$"):
         cortado.evaluate(problem, [{"viscosity": -1.0}, far])
     with warnings.catch_warnings():
@@ -291,9 +273,7 @@ def test_warnings_and_observers_of_workers_are_heard(problem, workers):
         cortado.evaluate(problem, POINTS[:2], alone, workers)
 
 
-# ---- what is lost ------------------------------------------------------------------------------------------------
 def test_a_worker_that_is_killed_half_way_changes_nothing(problem, processes, workers):
-    """Afterwards the scheduler is lost too."""
     arrived = []
 
     def kill(number, result):
@@ -306,7 +286,6 @@ def test_a_worker_that_is_killed_half_way_changes_nothing(problem, processes, wo
     assert [loss for loss, _ in found] == [problem.value(point) for point in POINTS]
     assert sorted(arrived) == list(range(len(POINTS)))
     assert {pid for _, pid in found} == {worker.pid for worker in processes.workers}
-
     with pytest.raises(ComputationError, match=r"^The scheduler tcp://127\.0\.0\.1:\d+ was lost, and"):
         workers.map(SlowValue(problem), POINTS, lambda *_: processes.process.kill())
 
@@ -326,11 +305,7 @@ def test_a_scheduler_without_workers_is_left_in_the_end():
 
 @pytest.mark.parametrize(
     "address, words",
-    [
-        ("tcp://127.0.0.1:1", "no scheduler answers there within 0.2 s"),
-        ("here", "missing port"),
-        (3, "scheduler is 3"),
-    ],
+    [("tcp://127.0.0.1:1", "no scheduler answers there within 0.2 s"), ("here", "missing port"), (3, "scheduler is 3")],
 )
 def test_a_scheduler_that_is_not_there_is_a_sentence(monkeypatch, address, words):
     monkeypatch.setattr(executors, "REACHED", 0.2)
@@ -348,7 +323,6 @@ def test_without_distributed_there_is_one_sentence(monkeypatch):
 
 
 def test_points_wait_for_the_first_worker(problem, tmp_path):
-    """None is there when the points are asked for."""
     with scheduler(tmp_path, workers=0) as processes, Distributed(processes.address) as executor:
         assert executor.threads() == 0
         later = threading.Timer(1.5, processes.start_worker)
@@ -358,40 +332,11 @@ def test_points_wait_for_the_first_worker(problem, tmp_path):
     assert [one.loss for one in found] == [problem.value(point) for point in POINTS]
 
 
-def test_what_is_launched_at_a_time_follows_the_workers():
-    """An executor of one's own may have none at first."""
-
-    class Growing(InProcess):
-        there = -1
-
-        def threads(self):
-            self.there += 1
-            return min(self.there, 2)
-
-    class Roomy:
-        def room(self, estimator=None):
-            return 4
-
-        def together(self, points, estimator=None):
-            sizes.append(len(points))
-            return [Estimate(0.0, {}) for _ in points]
-
-        def value(self, point):
-            sizes.append(1)
-            return 0.0
-
-    sizes = []
-    cortado.evaluate(Roomy(), POINTS, executor=Growing())
-    assert sizes == [4, 4, 2]
-
-
-# ---- local workers -----------------------------------------------------------------------------------------------
 @pytest.mark.filterwarnings("ignore:The worker .* was lost")
 def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
     monkeypatch.setattr("cortado.executors.visible_gpus", lambda: ["3", "GPU-5f1c"])
 
     def at_work(executor):
-        """Processes by their GPUs."""
         found, end = {}, time.monotonic() + PATIENCE
         while len(found) < 2 and time.monotonic() < end:
             found.update(executor.map(gpu_and_process, range(8)))
@@ -405,23 +350,12 @@ def test_each_process_has_one_gpu_also_when_it_is_started_again(monkeypatch):
     assert first["3"] != second["3"] and first["GPU-5f1c"] == second["GPU-5f1c"]
 
 
-def ended(way):
-    """Each of the first two items ends its process in this way, all times that it is computed."""
-    ends = {
-        "exit": lambda: sys.exit(1),
-        "killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
-        "asked to end": lambda: (os.kill(os.getpid(), signal.SIGTERM), time.sleep(5.0)),
-    }
-    return lambda number: ends[way]() if number < 2 else number
-
-
 @pytest.mark.filterwarnings("ignore:The worker .* was lost")
 def test_worker_processes_are_there_again_however_they_ended():
-    """One after the other, and one that is told to end without a next item."""
     with local_workers(1) as executor:
-        for way in ("exit", "killed", "asked to end"):
+        for way in (lambda: sys.exit(1), lambda: os.kill(os.getpid(), signal.SIGKILL)):
             with pytest.raises(ComputationError, match=r"ended its process|was given up, as 4 workers were lost"):
-                executor.map(ended(way), range(3))
+                executor.map(lambda number, way=way: way() if number < 2 else number, range(3))
             assert executor.map(square, range(3)) == [0, 1, 4]
         for code in (signal.SIGTERM, signal.SIGKILL):
             (pid,) = set(executor.map(process, range(2)))
@@ -439,7 +373,6 @@ def test_cores_are_shared_out(monkeypatch):
 
 
 def test_no_more_processes_than_items(monkeypatch):
-    """Nor than make sense on this machine, whatever there is to compute."""
     monkeypatch.setattr("cortado.executors.usable_cores", lambda: 2)
     started = []
 
@@ -453,12 +386,10 @@ def test_no_more_processes_than_items(monkeypatch):
         with Where(workers=workers).executor("cuda:0", items):
             pass
     assert started == [(1, "cuda"), (3, "cuda"), (1, "cuda")]
-    words = r"^--workers is {}, but must be at most 64, as this machine has 2 cores: more processes than cores"
-    for workers in (65, 10**6):
-        with pytest.raises(InputError, match=words.format(workers)):
-            Where(workers=workers)
-    with pytest.raises(InputError, match="--workers is 0"):
-        Where(workers=0)
+    with pytest.raises(
+        InputError, match=r"^--workers is 65, but must be at most 64, as this machine has 2 cores: more"
+    ):
+        Where(workers=65)
 
 
 @pytest.mark.parametrize(
@@ -466,10 +397,8 @@ def test_no_more_processes_than_items(monkeypatch):
     [
         (10**6, "cpu", r"number is 1000000, but must be at most \d+, as this machine has \d+ core"),
         (0, "cpu", "number is 0"),
-        (1.5, "cpu", "number is 1.5"),
         (None, "cuda:1", "device is 'cuda:1'"),
         (None, "cuda", "1 worker processes need a GPU each, but there are 0 GPUs"),
-        (3, "cuda", "3 worker processes need a GPU each, but there are 0 GPUs"),
     ],
 )
 def test_wrong_local_workers_are_a_sentence(monkeypatch, number, device, words):

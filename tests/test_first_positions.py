@@ -23,15 +23,13 @@ def squeezed(positions, factor):
 
 
 def told(work):
-    """The warnings of some work, in words."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         work()
     return [str(one.message) for one in caught if issubclass(one.category, CortadoWarning)]
 
 
-@pytest.mark.parametrize("make", [plane, scene])
-@pytest.mark.parametrize("apart", [0.0, 1e-9])
+@pytest.mark.parametrize("make, apart", [(plane, 0.0), (scene, 1e-9)])
 def test_two_particles_at_one_place_are_refused(make, apart):
     problem, x = problem_of(make())
     x = x.copy()
@@ -79,6 +77,8 @@ def test_a_lattice_that_is_squeezed_a_little_and_near_particles_are_warned_of_on
 
     (sentence,) = told(search)
     assert sentence.startswith("particles at initial_positions are compressed by ") and "fly apart" in sentence
+    disturbed = np.clip(x + 0.005 * np.random.default_rng(3).standard_normal(x.shape), 0.01, None)
+    assert told(lambda: problem_of(plane())[0].value({"initial_positions": disturbed})) == []
     x = x.copy()
     x[0] = x[1] + [-0.3 * 0.05, 0.0]
     (sentence,) = told(lambda: problem_of(plane())[0].value({"initial_positions": x}))
@@ -86,7 +86,6 @@ def test_a_lattice_that_is_squeezed_a_little_and_near_particles_are_warned_of_on
 
 
 def test_positions_that_move_little_by_little_are_judged_where_they_come_to():
-    """Though no step of them is long."""
     problem, x = problem_of(plane())
     for factor in np.arange(1.0, 0.96, -0.004):
         problem.value({"initial_positions": squeezed(x, factor)})
@@ -95,15 +94,7 @@ def test_positions_that_move_little_by_little_are_judged_where_they_come_to():
             problem.value({"initial_positions": squeezed(x, factor)})
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
-def test_a_disturbed_lattice_is_no_mistake(noise):
-    problem, x = problem_of(plane())
-    disturbed = np.clip(x + noise * 0.05 * np.random.default_rng(3).standard_normal(x.shape), 0.01, None)
-    assert told(lambda: problem.value({"initial_positions": disturbed})) == []
-
-
 def test_a_search_refuses_steps_that_crowd_particles():
-    """And a line search leaves such trials aside."""
     problem, x = problem_of(plane())
     together, start = Problem(problem.simulation, 1, losses.FinalPositions(squeezed(x, 0.7))), {"initial_positions": x}
     with pytest.warns(CortadoWarning, match="compressed"):
@@ -112,7 +103,6 @@ def test_a_search_refuses_steps_that_crowd_particles():
     assert found.refused > 0 and max(found.loss, aside.loss) < together.value(start)
 
 
-# ---- limits of stability -----------------------------------------------------------------------------------------
 def test_each_limit_of_stability_is_told_once():
     problem, _ = problem_of(plane())
 
@@ -126,21 +116,18 @@ def test_each_limit_of_stability_is_told_once():
     assert "comes from viscosity" in sentences[0] and "comes from viscosity" not in sentences[1]
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper", "theirs"), [([0.5, 0.5], [0.8, 0.8], 0.008), ([0.5, 0.3], [0.8, 0.6], 0.023)]
-)
-def test_first_positions_are_found_from_last_ones(lower, upper, theirs):
-    """After 7 iterations nearer than JAX-SPH's notebook after 15; the second cube hits the floor on the way. Steps are
+def test_first_positions_are_found_from_last_ones():
+    """Of a cube that hits the floor on the way: after 7 iterations nearer than JAX-SPH's notebook after 15. Steps are
     four times as long as in docs/layers.md, to be quick."""
     jax = pytest.importorskip("jax", reason="JAX is not installed", exc_type=ImportError)
     import cortado.jax
 
     box = cortado.load_scene("docs/figures/falling_cube.toml")
-    box = box.replaced(f"fluid.0.lower={lower}", f"fluid.0.upper={upper}", "solver.time_step=0.02")
+    box = box.replaced("fluid.0.lower=[0.5, 0.3]", "fluid.0.upper=[0.8, 0.6]", "solver.time_step=0.02")
     guess = cortado.Simulation(box.replaced("fluid.0.lower=[0.075, 0.475]", "fluid.0.upper=[0.375, 0.775]"))
     true = cortado.Simulation(box)
     last = true.run(25).positions[-1]
-    assert (last[:, 1].min() < 0.05) == (lower[1] < 0.5)
+    assert last[:, 1].min() < 0.05
     distance = cortado.jax.value(cortado.Problem(guess, 25, cortado.losses.FinalPositions(last)))
     slope = jax.jit(jax.value_and_grad(lambda x: distance({"initial_positions": x})))
     positions = jax.numpy.asarray(guess.positions, dtype="float32")
@@ -148,5 +135,5 @@ def test_first_positions_are_found_from_last_ones(lower, upper, theirs):
     for _ in range(7):
         value, gradient = slope(positions)
         positions -= 0.25 * len(positions) * gradient
-    assert np.sqrt(value / 2.0) < theirs
+    assert np.sqrt(value / 2.0) < 0.023
     assert np.sqrt(np.mean((positions - true.positions) ** 2)) < 0.2 * begun

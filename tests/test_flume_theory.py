@@ -67,22 +67,6 @@ def test_dry_friction_takes_what_coulomb_says(body):
     assert speed[200] == pytest.approx(1.0 - 201 * step * 10.0 / mass, abs=0.01) and abs(speed[-1]) < 0.01
 
 
-def test_bars_with_a_discrepancy_hold(body):
-    """With waves that last and that no number explains, bars of noise alone are too short, and these hold."""
-    times, random, missed, ratios = np.arange(0.0, 15.0, 0.02), np.random.default_rng(2), [], []
-    shapes = np.stack([np.sin(7.0 * times), np.cos(7.0 * times), np.sin(7.0 * times + 1.0)], axis=1)
-    names = body["fitted"].__globals__
-    names["moved"] = lambda flume, times, stroke, u: shapes * np.exp(u)
-    for _ in range(2):
-        slow = np.stack([np.convolve(random.normal(size=len(times) + 149), np.hanning(150), "valid") for _ in "abcdef"])
-        turning = (np.exp(7j * times) * (slow[:3] + 1j * slow[3:])).real.T
-        measured = shapes + 0.3 * turning / turning.std(axis=0)
-        _, found, bars, _ = body["fitted"](None, times, None, measured, 2.0 * np.pi / 7.0, np.zeros(3))
-        missed.append(np.abs(found) > 2.5 * bars[2])
-        ratios.append(bars[0] / bars[2])
-    assert np.mean(missed) < 0.15 and np.mean(ratios) < 0.6
-
-
 def test_the_section_of_a_run_has_the_numbers_that_are_told(monkeypatch, tmp_path, capsys):
     """Centre of gravity, radius of gyration and springs within two bars, which are at most 10 %."""
     monkeypatch.chdir(tmp_path)

@@ -2,16 +2,15 @@
 
 import gc
 import pickle
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
 from cortado import InputError, Problem, Simulation, losses
-from cortado.device.launching import KernelLauncher, bound, launch, launch_together, watched
-from cortado.device.precision import BY_SIZE, FLOAT32, FLOAT64, lanes_for, lanes_of
-from cortado.device.reduction import SHARED, add, sum_and_maximum, sum_and_maximum_kernel, sum_kernel, sum_of
+from cortado.device.launching import bound
+from cortado.device.precision import FLOAT32, FLOAT64, lanes_of
+from cortado.device.reduction import SHARED, sum_and_maximum, sum_and_maximum_kernel, sum_kernel, sum_of
 from cortado.discretise.smoothing import CUBIC_SPLINE, WENDLAND_C4
 from cortado.gradients.reverse_mode import adjoint_filter_kernels
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
@@ -42,30 +41,10 @@ def test_arguments_come_in_the_order_of_the_kernel_and_of_groups_and_a_misspelt_
     assert found == [60, 30, 1, 3, 4, 40, 50]
     with pytest.raises(TypeError, match="has no argument 'xstar'; it has particles, time_step, x, v, acc"):
         bound(PREDICT, (), {**dict.fromkeys(NAMES, 0), "xstar": 0})
-
-
-@pytest.mark.parametrize("missing", NAMES)
-def test_a_missing_argument_is_named(missing):
-    given = {name: 0 for name in NAMES if name != missing}
-    told = f"argument '{missing}' of kernel .*predict.* is missing; it has particles, time"
-    with pytest.raises(TypeError, match=told):
-        bound(PREDICT, (), given)
     groups = dict.fromkeys(("particles", "time_step", "x", "v", "xstar"), 0), {"x": 1, "acceleration": 2}
     told = r"'x_star' of .* is missing; .*; known are v_star, particles, time_step, x, v, xstar, acc"
     with pytest.raises(TypeError, match=told):
         bound(PREDICT, groups, {"v_star": 0})
-
-
-@pytest.mark.parametrize("by", ["launch", "launcher"])
-def test_launches_compute_what_kernels_say(by):
-    arrays = {name: wp.full(3, wp.vec3d(2.0, 3.0, 4.0), dtype=wp.vec3d, device=CPU) for name in NAMES[2:]}
-    arrays["particles"], arrays["time_step"] = 3, wp.full(1, 0.5, dtype=wp.float64, device=CPU)
-    if by == "launch":
-        launch(PREDICT, 3, CPU, arrays)
-    else:
-        KernelLauncher(3, CPU, record_tape=False)(PREDICT, arrays)
-    assert arrays["v_star"].numpy().tolist() == [[3.0, 4.5, 6.0]] * 3
-    assert arrays["x_star"].numpy().tolist() == [[3.5, 5.25, 7.0]] * 3
 
 
 def test_a_sum_over_neighbours_has_a_thread_for_each_particle():
@@ -127,43 +106,7 @@ def test_arrays_of_derivatives_that_are_gone_are_let_go():
     assert not kept
 
 
-def test_launches_together_are_one_to_a_watcher():
-    """It may repeat them, but only all of them."""
-    seen, done = [], []
-
-    def watch(name, threads, arguments, work):
-        seen.append((name, threads))
-        work()
-        work()
-
-    def work():
-        for total in (first, second):
-            launch(count, 3, "cpu", total=total)
-            done.append(total)
-
-    @wp.kernel(enable_backward=False)
-    def count(total: wp.array(dtype=wp.int32)):
-        wp.atomic_add(total, 0, 1)
-
-    first, second = (wp.zeros(1, dtype=wp.int32, device="cpu") for _ in range(2))
-    with watched(watch):
-        launch_together("both", 3, (first, second), work)
-        launch(count, 3, "cpu", total=first)
-    assert seen == [("both", 3), (count.key, 3)]
-    assert done == [first, second] * 2 and first.numpy() == 12 and second.numpy() == 6
-
-
-def test_few_particles_get_many_lanes_and_a_cpu_has_one():
-    gpu, cpu = (SimpleNamespace(is_cpu=is_cpu) for is_cpu in (False, True))
-    sizes = [1, *(most for most, _ in BY_SIZE), *(most + 1 for most, _ in BY_SIZE), 10**7]
-    found = [lanes_for(size, gpu) for size in sorted(sizes)]
-    assert found == sorted(found, reverse=True) and found[-1] == 1
-    assert all(32 % lanes == 0 for lanes in found)
-    assert {lanes_for(size, cpu) for size in sizes} == {1}
-    assert lanes_for(100, gpu, 2) == 2 and lanes_for(100, cpu, 2) == 1
-
-
-@pytest.mark.parametrize("lanes", [3, 0, 32, "four", 1.5, True])
+@pytest.mark.parametrize("lanes", [3, 0, 32, "four"])
 def test_a_wrong_number_of_lanes_is_a_sentence(lanes):
     with pytest.raises(InputError, match=r"^lanes is .*, but must be .*[.]$"):
         Simulation(scene(), lanes=lanes)
@@ -176,7 +119,6 @@ def test_copies_have_the_same_lanes():
 
 
 def kernels_of(discretisation):
-    """Every kernel that is made for lanes; mixtures of two and of three phases."""
     curved, viscous = curvature_kernels(discretisation, 3), stress_kernels(discretisation, 3, newtonian_law(), True)
     mixtures = [
         diffusion_kernels(Diffusion(discretisation, *kinds))
@@ -219,12 +161,7 @@ def test_sums_by_blocks_compile_for_a_gpu_that_is_not_there(dtype, tmp_path):
     level = sum_kernel(dtype, is_cpu=False)
     assert level.threads * wp.types.type_size_in_bytes(dtype) <= SHARED
     compiles(level.kernel.module, tmp_path)
-
-
-@NVRTC
-@pytest.mark.parametrize("precision", [FLOAT32, FLOAT64])
-def test_error_sums_by_blocks_compile_for_a_gpu_that_is_not_there(precision, tmp_path):
-    compiles(sum_and_maximum_kernel(precision, is_cpu=False).kernel.module, tmp_path)
+    compiles(sum_and_maximum_kernel(FLOAT64, is_cpu=False).kernel.module, tmp_path)
 
 
 COMBINATIONS = [(CUBIC_SPLINE, FLOAT32, 8), (WENDLAND_C4, FLOAT64, 16)]
@@ -244,7 +181,7 @@ def test_kernels_for_lanes_compile_for_a_gpu_that_is_not_there(k, tmp_path):
         compiles(module, tmp_path)
 
 
-SIZES = [1, 2, 63, 64, 65, 128, 4096, 4097, 5000]
+SIZES = [1, 64, 65, 4097, 5000]
 precisions = pytest.mark.parametrize("precision", [FLOAT32, FLOAT64], ids=lambda precision: precision.name)
 
 
@@ -277,17 +214,6 @@ def test_sum_of(size, type_of, precision):
     np.testing.assert_allclose(first[0], values.astype(np.float64).sum(axis=0), rtol=0, atol=error)
     whole = np.arange(values.size).reshape(values.shape) % 7  # every partial sum is exact
     np.testing.assert_array_equal(summed(tree, whole.astype(precision.numpy), dtype)[0], whole.sum(axis=0))
-
-
-@precisions
-@types
-def test_add(type_of, precision):
-    dtype = type_of(precision)
-    shape = (60, *getattr(dtype, "_shape_", ()))
-    values, total = np.random.default_rng(81).standard_normal((2, *shape)).astype(precision.numpy)
-    target = wp.array(total, dtype=dtype, device="cpu")
-    add(wp.array(values, dtype=dtype, device="cpu"), target)
-    np.testing.assert_array_equal(target.numpy(), total + values)
 
 
 @precisions

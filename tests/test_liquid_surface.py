@@ -22,7 +22,6 @@ SPACING = 0.1
 
 
 def ball(radius=0.6, centre=(0.0, 0.0, 0.0)):
-    """(n, 3) [m] a lattice in a ball."""
     axis = np.arange(-radius, radius + SPACING, SPACING)
     lattice = np.stack([one.ravel() for one in np.meshgrid(axis, axis, axis)], axis=1)
     return lattice[np.linalg.norm(lattice, axis=1) < radius] + centre
@@ -56,7 +55,6 @@ def test_the_surface_of_a_ball_is_round_and_closed():
 
 
 def test_every_particle_that_is_alone_is_a_drop():
-    """Whatever corner of a cube or a block it is at."""
     places = np.random.default_rng(0).uniform(-4.0, 4.0, (40, 3))
     mesh = mesh_of(surface_of(places))
     assert mesh.body_count == len(places) and mesh.is_watertight
@@ -84,13 +82,6 @@ def test_the_lattice_is_fixed_in_space():
     np.testing.assert_allclose(moved.points, alone.points + 7 * block, atol=1e-5)
 
 
-def test_the_order_of_particles_changes_nothing():
-    positions = ball(0.4) + 0.02 * np.random.default_rng(0).standard_normal(ball(0.4).shape)
-    one, other = surface_of(positions), surface_of(positions[::-1])
-    np.testing.assert_allclose(one.points, other.points, atol=1e-6)
-    np.testing.assert_array_equal(one.triangles, other.triangles)
-
-
 def test_points_have_the_colours_of_particles_near_them():
     positions = ball()
     colours = np.where(positions[:, :1] > 0.01, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -111,7 +102,6 @@ def test_what_is_far_away_is_left_out_and_what_is_no_number_is_a_sentence():
 
 
 def resting(shape, container):
-    """Fluid of so many particles along each axis, or a cylinder of them, at rest in the corner of its container."""
     size = SPACING * np.array(shape)
     if container == "cylinder":
         place = {"shape": "cylinder", "base": [0.0, 0.0, 0.0], "radius": 0.5 * size[0]}
@@ -124,11 +114,7 @@ def resting(shape, container):
 
 @pytest.mark.parametrize(
     "shape, container",
-    [
-        *((shape, "pool") for shape in ((10, 5, 10), (20, 20, 20))),
-        *(((n, n, n), "dam") for n in (8, 13, 20)),
-        *(((n, n, n), "cylinder") for n in (11, 13)),
-    ],
+    [((10, 5, 10), "pool"), ((13, 13, 13), "dam"), ((20, 20, 20), "dam"), ((11, 11, 11), "cylinder")],
 )
 @pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
 def test_fluid_at_rest_ends_at_walls_and_has_its_volume(shape, container):
@@ -150,7 +136,6 @@ def test_fluid_at_rest_ends_at_walls_and_has_its_volume(shape, container):
 
 
 def lattice(*counts):
-    """(n, 3) [m]"""
     axes = [SPACING * (np.arange(count) + 0.13) for count in counts]
     return np.stack([one.ravel() for one in np.meshgrid(*axes, indexing="ij")], axis=1)
 
@@ -159,10 +144,7 @@ RANDOM = np.random.default_rng(0)
 APART = 11.3 * lattice(4, 4, 4) + RANDOM.uniform(0.0, 2.0 * SPACING, (64, 3))
 FLUIDS = {
     "drops of one particle": APART,
-    "drops of two": np.concatenate([APART, APART + [0.7 * SPACING, 0.0, SPACING]]),
-    "thread": lattice(20, 1, 1),
     "sheet": lattice(12, 12, 1),
-    "sheet out of order": lattice(14, 14, 1) + 0.02 * RANDOM.standard_normal((196, 3)),
     "cube": lattice(8, 8, 8),
     "spray in a twentieth of space": RANDOM.uniform(0.0, 16.0 * SPACING, (200, 3)),
     "spray in half of space": RANDOM.uniform(0.0, 12.0 * SPACING, (864, 3)),
@@ -208,7 +190,7 @@ def test_bodies_of_fluid_are_moved_each_by_its_own_distance():
     np.testing.assert_array_equal(moved[-8:], points[-8:])
 
 
-@pytest.mark.parametrize("rounds", [0, 1, 2, 5])
+@pytest.mark.parametrize("rounds", [0, 5])
 def test_values_are_smoothed_to_and_fro_however_launches_are_made(rounds, monkeypatch):
     """Towards the mean of neighbours on a ring, as NumPy does; what is given stays as it is."""
     launch, given = BandLauncher(wp.get_device("cpu")), np.random.default_rng(0).random((50, 3)).astype(np.float32)

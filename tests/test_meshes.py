@@ -1,6 +1,5 @@
 """Meshes as solids: distances against closed forms, and a sentence for each file that is none."""
 
-import time
 import warnings
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +11,12 @@ from scipy.spatial import cKDTree
 
 from bad_scenes import assert_one_sentence, one_sentence
 from cortado.discretise.mesh import Mesh
-from cortado.discretise.mesh_files import mesh_in_file, read_mesh, read_triangles, thickness_of
-from cortado.discretise.primitives import Box, Round, points_inside
+from cortado.discretise.mesh_files import mesh_in_file, read_mesh, read_triangles
+from cortado.discretise.primitives import Box, Round
 from cortado.discretise.solid import Hollow, Mass, Placed
 from cortado.discretise.solid_walls import surface_feet, surface_points
 from cortado.errors import CortadoWarning, InputError
-from cortado.scene.solid_shapes import MeshSolid, PolygonSolid
+from cortado.scene.solid_shapes import MeshSolid
 
 MAJOR, MINOR = 0.25, 0.1
 SPACING, SUPPORT = 0.05, 0.1
@@ -59,7 +58,6 @@ def read(path: str, scale: float = 1.0, container=ROOM, support: float = SUPPORT
 
 
 def quietly_read(path: str) -> Mesh:
-    """Without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
         return read(path, support=SPACING)
@@ -67,7 +65,6 @@ def quietly_read(path: str) -> Mesh:
 
 @contextmanager
 def told_of(words: str):
-    """A warning of one sentence."""
     with pytest.warns(CortadoWarning, match=words) as told:
         yield
     assert_one_sentence(str(told[0].message))
@@ -77,7 +74,6 @@ def cloud(count: int = 4000, reach: float = 0.6) -> np.ndarray:
     return np.random.default_rng(5).uniform(-reach, reach, size=(count, 3))
 
 
-# ---- good ones ---------------------------------------------------------------------------------------------------
 def test_a_box_of_triangles_is_a_box():
     half, points = np.array([0.2, 0.3, 0.1]), cloud()
     mesh, same = solid(box(-half, half)), Box(half)
@@ -109,17 +105,6 @@ def test_a_torus_has_its_distances_nearest_points_and_hole():
     np.testing.assert_allclose(np.linalg.norm(points - feet, axis=1), np.abs(mesh.distance(points)), atol=1e-15)
     bounded = mesh.distance_up_to(points, 0.05)
     np.testing.assert_array_equal(bounded, np.clip(mesh.distance(points), -0.05, 0.05))
-
-
-def test_distances_are_those_to_the_nearest_of_all_triangles():
-    """Found one by one, by minimising over the corners' weights on a fine grid."""
-    mesh, points = solid(trimesh.creation.icosphere(1, 0.4)), cloud(40)
-    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 81), np.linspace(0, 1, 81)))
-    weights = np.stack([1 - u - v, u, v], axis=1)[u + v <= 1.0 + 1e-12]
-    places = np.einsum("wc,kcd->kwd", weights, mesh.corners).reshape(-1, 3)
-    grid = cKDTree(places).query(points)[0]
-    away = np.abs(mesh.distance(points))
-    assert (away <= grid + 1e-15).all() and (grid < away + 2e-4 / np.maximum(away, 0.02)).all()
 
 
 def test_points_beside_corners_edges_and_columns_of_vertices_have_the_right_sign():
@@ -189,11 +174,9 @@ def test_boxes_that_overlap_or_touch_are_their_union(tmp_path):
         mesh = quietly_read(written(tmp_path, joined(*(box(*end) for end in ends))))
         halves = [(np.array(end[1]) - end[0]) / 2 for end in ends]
         boxes = [Placed(Box(half), end[0] + half, np.eye(3)) for half, end in zip(halves, np.array(ends), strict=True)]
-        distances, places = (
-            np.array([getattr(one, name)(points) for one in boxes]) for name in ("distance", "nearest")
-        )
+        distances, places = np.array([one.distance(points) for one in boxes]), [one.nearest(points) for one in boxes]
         np.testing.assert_allclose(mesh.distance(points), distances.min(axis=0), atol=1e-7)
-        nearest = places[distances.argmin(axis=0), np.arange(len(points))]
+        nearest = np.array(places)[distances.argmin(axis=0), np.arange(len(points))]
         np.testing.assert_allclose(mesh.nearest(points), nearest, atol=1e-7)
 
 
@@ -227,25 +210,19 @@ def test_a_body_within_another_is_told(tmp_path):
 PLANK = ([0.0, 0.0, 0.0], [0.8, 0.1, 0.2])
 UNIONS = {  # boxes of a file, and boxes with signs that sum up to their union
     "nested": ([PLANK, ([0.6, 0.02, 0.05], [0.7, 0.08, 0.15])], [(1, PLANK)]),
-    "nested in a corner": ([PLANK, ([0.0, 0.0, 0.0], [0.3, 0.05, 0.1])], [(1, PLANK)]),
-    "flush": ([PLANK, ([0.5, 0.0, 0.0], [1.2, 0.1, 0.2])], [(1, ([0.0, 0.0, 0.0], [1.2, 0.1, 0.2]))]),
     "touching": ([PLANK, ([0.8, 0.0, 0.0], [1.2, 0.1, 0.2])], [(1, ([0.0, 0.0, 0.0], [1.2, 0.1, 0.2]))]),
     "crossing": (
         [([-0.4, -0.05, -0.4], [0.4, 0.05, 0.4]), ([-0.04, -0.5, -0.04], [0.04, 0.2, 0.04])],
         [
-            (1, ([-0.4, -0.05, -0.4], [0.4, 0.05, 0.4])),
-            (1, ([-0.04, -0.5, -0.04], [0.04, -0.05, 0.04])),
+            *((1, ([-0.4, -0.05, -0.4], [0.4, 0.05, 0.4])), (1, ([-0.04, -0.5, -0.04], [0.04, -0.05, 0.04]))),
             (1, ([-0.04, 0.05, -0.04], [0.04, 0.2, 0.04])),
         ],
     ),
     "three": (
         [PLANK, ([0.5, -0.2, 0.0], [0.6, 0.3, 0.2]), ([0.55, -0.1, 0.05], [0.9, 0.2, 0.15])],
         [
-            (1, PLANK),
-            (1, ([0.5, -0.2, 0.0], [0.6, 0.0, 0.2])),
-            (1, ([0.5, 0.1, 0.0], [0.6, 0.3, 0.2])),
-            (1, ([0.6, -0.1, 0.05], [0.9, 0.2, 0.15])),
-            (-1, ([0.6, 0.0, 0.05], [0.8, 0.1, 0.15])),
+            *((1, PLANK), (1, ([0.5, -0.2, 0.0], [0.6, 0.0, 0.2])), (1, ([0.5, 0.1, 0.0], [0.6, 0.3, 0.2]))),
+            *((1, ([0.6, -0.1, 0.05], [0.9, 0.2, 0.15])), (-1, ([0.6, 0.0, 0.05], [0.8, 0.1, 0.15]))),
         ],
     ),
 }
@@ -253,13 +230,12 @@ UNIONS = {  # boxes of a file, and boxes with signs that sum up to their union
 
 @pytest.mark.parametrize("name", UNIONS)
 @pytest.mark.parametrize("turn", [np.eye(3), TURN], ids=["along the axes", "turned"])
-@pytest.mark.parametrize(("suffix", "error"), [("ply", 1e-6), ("obj", 1e-12)])  # of float32, and of all digits
-def test_the_moments_of_bodies_are_those_of_their_union(tmp_path, name, turn, suffix, error):
+def test_the_moments_of_bodies_are_those_of_their_union(tmp_path, name, turn):
     bodies, parts = UNIONS[name]
     mesh = joined(*(box(*ends) for ends in bodies))
     mesh.vertices = mesh.vertices @ turn.T
-    mesh.export(tmp_path / f"mesh.{suffix}", **({"digits": 17} if suffix == "obj" else {}))
-    found = mesh_in_file(str(tmp_path / f"mesh.{suffix}")).mesh.moments()
+    mesh.export(tmp_path / "mesh.obj", digits=17)
+    found = mesh_in_file(str(tmp_path / "mesh.obj")).mesh.moments()
     volumes = np.array([sign * np.prod(np.subtract(*ends[::-1])) for sign, ends in parts])
     middles = np.array([np.mean(ends, axis=0) for _, ends in parts])
     centre = volumes @ middles / volumes.sum()
@@ -267,36 +243,17 @@ def test_the_moments_of_bodies_are_those_of_their_union(tmp_path, name, turn, su
         volume * (np.diag(np.subtract(*ends) ** 2) / 12.0 + np.outer(middle - centre, middle - centre))
         for volume, middle, (_, ends) in zip(volumes, middles, parts, strict=True)
     )
-    assert found.volume == pytest.approx(volumes.sum(), rel=error)
-    np.testing.assert_allclose(found.centre, turn @ centre, atol=error)
-    np.testing.assert_allclose(found.second, turn @ second @ turn.T, atol=error * np.abs(second).max())
+    assert found.volume == pytest.approx(volumes.sum(), rel=1e-12)
+    np.testing.assert_allclose(found.centre, turn @ centre, atol=1e-12)
+    np.testing.assert_allclose(found.second, turn @ second @ turn.T, atol=1e-12 * np.abs(second).max())
 
 
-def test_the_middle_of_a_plank_does_not_feel_a_box_inside_of_it(tmp_path):
-    path = written(tmp_path, joined(box(*PLANK), box([0.6, 0.02, 0.05], [0.7, 0.08, 0.15])), "plank.obj")
-    table = MeshSolid(name="plank", shape="mesh", file=path, scale=2.0)
-    np.testing.assert_allclose(table.middle(), [0.8, 0.1, 0.2], atol=1e-12)
-    assert Mass.of(table.own_solid()).volume == pytest.approx(8.0 * 0.016, rel=1e-12)
-    np.testing.assert_allclose(table.solid().distance(np.array([[1.3, 0.1, 0.2], [1.65, 0.1, 0.2]])), [-0.1, 0.05])
-
-
-def test_balls_that_overlap_are_a_lens_lighter(tmp_path):
-    first, second = (trimesh.creation.icosphere(4, 0.4) for _ in range(2))
-    mesh = mesh_in_file(written(tmp_path, joined(first, second.apply_translation([0.3, 0, 0])))).mesh
-    height = 0.4 - 0.15
-    lens = 2.0 * np.pi * height**2 * (1.2 - height) / 3.0
-    assert mesh.moments().volume == pytest.approx(8.0 / 3.0 * np.pi * 0.4**3 - lens, rel=4e-3)
-    np.testing.assert_allclose(mesh.moments().centre, [0.15, 0.0, 0.0], atol=1e-4)
-
-
-# ---- far from the origin -----------------------------------------------------------------------------------------
 FAR = {"1e5 m": [1e5, 1e5, 1e5], "on a map": [512345.0, 5412345.0, 100.0]}
 
 
-@pytest.mark.parametrize("place", FAR)
-def test_far_from_the_origin_a_solid_is_as_near_it(tmp_path, place):
+def test_far_from_the_origin_a_solid_is_as_near_it(tmp_path):
     shape, places = joined(torus(30, 16), box([0.2, -0.2, -0.2], [0.6, 0.2, 0.2])), []
-    for name, shift in (("near", np.zeros(3)), ("far", np.array(FAR[place]))):
+    for name, shift in (("near", np.zeros(3)), ("far", np.array(FAR["on a map"]))):
         far = trimesh.Trimesh(shape.vertices + shift, shape.faces, process=False)
         far.export(tmp_path / f"{name}.obj", digits=12)
         path = str(tmp_path / f"{name}.obj")
@@ -309,16 +266,7 @@ def test_far_from_the_origin_a_solid_is_as_near_it(tmp_path, place):
         np.testing.assert_allclose(far, near, atol=3e-9)
 
 
-def test_a_polygon_far_from_the_origin_is_about_its_middle():
-    corners = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.125], [0.125, 0.125], [0.125, 0.5], [0.0, 0.5]])
-    near, far = (
-        PolygonSolid(name="one", shape="polygon", corners=(corners + shift).tolist()) for shift in (0.0, 5412345.0)
-    )
-    np.testing.assert_allclose(far.middle() - 5412345.0, near.middle(), atol=2e-9)
-    np.testing.assert_allclose(Mass.of(far.own_solid()).inertia, Mass.of(near.own_solid()).inertia, rtol=1e-7)
-
-
-@pytest.mark.parametrize("name", ["ball.stl", "ball.ply", "ball.glb"])
+@pytest.mark.parametrize("name", ["ball.stl", "ball.glb"])
 def test_a_file_of_float32_far_from_the_origin_is_a_sentence(tmp_path, name):
     ball = trimesh.creation.icosphere(3, 0.4)
     with one_sentence("far from the origin: move it before it is exported"):
@@ -356,7 +304,7 @@ def test_a_mesh_that_crosses_itself_is_told_and_holds_what_it_goes_around_twice(
     assert np.linalg.norm(feet, axis=1).min() > 0.06  # none in the middle, where the branches go through one another
 
 
-@pytest.mark.parametrize("name", ["a.stl", "a.STL", "ascii.stl", "a.obj", "a.ply", "ascii.ply", "a.glb"])
+@pytest.mark.parametrize("name", ["a.STL", "ascii.stl", "a.obj", "a.ply", "ascii.ply", "a.glb"])
 def test_all_kinds_of_files_hold_the_same(tmp_path, name):
     mesh = torus(20, 12)
     kinds = {"ascii.stl": {"file_type": "stl_ascii"}, "ascii.ply": {"encoding": "ascii"}, "a.STL": {"file_type": "stl"}}
@@ -407,17 +355,6 @@ def test_a_mesh_is_scaled_and_read_again_when_its_file_changes(tmp_path):
     np.testing.assert_allclose(np.multiply(first, 0.9), second, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("mesh", "volume"), [(box([0.1, 0.2, 0.3], [0.6, 0.7, 0.5]), 0.05), (torus(), 2 * np.pi**2 * MAJOR * MINOR**2)]
-)
-def test_points_inside_are_on_the_lattice_from_the_lower_corner(mesh, volume):
-    found = points_inside(solid(mesh), 0.02)
-    cells = (found - solid(mesh).extent()[0]) / 0.02 - 0.5
-    np.testing.assert_allclose(cells, np.rint(cells), atol=1e-9)
-    assert len(found) * 0.02**3 == pytest.approx(volume, rel=1e-9 if len(mesh.faces) == 12 else 0.01)
-
-
-# ---- points of a surface -----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["torus", "box", "ball"])
 @pytest.mark.parametrize("depth", [0.0, 0.5, -0.5])
 def test_points_of_a_surface_are_even(name, depth):
@@ -425,7 +362,7 @@ def test_points_of_a_surface_are_even(name, depth):
     makers = {"torus": torus(200, 80), "box": box([-0.2, -0.3, -0.1], [0.2, 0.3, 0.1])}
     mesh = solid(makers[name] if name in makers else trimesh.creation.icosphere(5, 0.3))
     found = surface_points(mesh, spacing, depth * spacing)
-    np.testing.assert_allclose(mesh.distance(found.points).min(), -max(depth, depth) * spacing, atol=0.3 * spacing)
+    np.testing.assert_allclose(mesh.distance(found.points).min(), -depth * spacing, atol=0.3 * spacing)
     if depth == 0.0:
         assert found.shares.sum() * spacing**2 == pytest.approx(mesh.areas().sum(), rel=0.01)
     nearest = cKDTree(found.points).query(found.points, k=2)[0][:, 1]
@@ -450,11 +387,6 @@ def test_feet_stand_for_equal_areas_and_point_outwards():
     np.testing.assert_allclose(turned, outward @ TURN.T, atol=1e-14)
 
 
-# ---- bad ones ----------------------------------------------------------------------------------------------------
-def without(mesh: trimesh.Trimesh, count: int) -> trimesh.Trimesh:
-    return trimesh.Trimesh(mesh.vertices, mesh.faces[count:], process=False)
-
-
 def half_turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     faces = np.array(mesh.faces)
     faces[7] = faces[7, ::-1]
@@ -475,22 +407,17 @@ def figure_of_eight() -> trimesh.Trimesh:
     return quads(places, flipped=True)
 
 
-def not_a_number() -> trimesh.Trimesh:
-    vertices = np.array(box([-0.2] * 3, [0.2] * 3).vertices)
-    vertices[3, 1] = np.nan
-    return trimesh.Trimesh(vertices, box([-0.2] * 3, [0.2] * 3).faces, process=False)
-
-
-def back_to_back() -> trimesh.Trimesh:
-    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]], process=False)
-
-
+SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 BALL = trimesh.creation.icosphere(3, 0.4)
 BAD = {
-    "a hole": (without(BALL, 1), r"is not closed.* 3 open edges, the first at \(.*in the file; close its holes"),
-    "a sheet": (back_to_back(), "holds no volume: all of its 4 triangles"),
-    "half a sheet": (without(back_to_back(), 2), "4 open edges"),
+    "a hole": (
+        trimesh.Trimesh(BALL.vertices, BALL.faces[1:], process=False),
+        r"is not closed.* 3 open edges, the first at \(.*in the file; close its holes",
+    ),
+    "a sheet": (
+        trimesh.Trimesh(SQUARE, [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]], process=False),
+        "holds no volume: all of its 4 triangles",
+    ),
     "normals inwards": (turned_over(BALL), r"^The normals of .* point inwards, .*all of its triangles over"),
     "a body inside out": (
         joined(BALL, turned_over(box([1, 1, 1], [1.3, 1.3, 1.3]))),
@@ -509,10 +436,6 @@ BAD = {
         box([0, 0, 0], [0.5, 0.5, 0.01]),
         r"thinner than half a spacing, 0.025 m, at 9[67]% .* make it thicker",
     ),
-    "a fin too thin": (
-        joined(box([0, 0, 0], [0.5, 0.5, 0.2]), box([0.1, 0.1, 0.1], [0.4, 0.11, 0.5])),
-        r"thinner than half a spacing.* at 1[67]% of its surface, .* at \(0\.[1-4]\d*, 0.1",
-    ),
 }
 
 
@@ -526,8 +449,10 @@ def test_a_bad_mesh_is_a_sentence_that_says_which_where_and_what_to_do(tmp_path,
 
 
 def test_vertices_that_are_not_finite_and_files_that_cannot_be_meant_are_sentences(tmp_path):
+    lost = box([-0.2] * 3, [0.2] * 3)
+    lost.vertices[3, 1] = np.nan
     with one_sentence(r"1 vertex with coordinates that are not finite.* number \d+"):
-        read(written(tmp_path, not_a_number(), "nan.ply"))
+        read(written(tmp_path, trimesh.Trimesh(lost.vertices, lost.faces, process=False), "nan.ply"))
     (tmp_path / "a.step").write_text("")
     (tmp_path / "line.obj").write_text("v 0 0 0\nv 1 0 0\nl 1 2\n")
     for call, name, trouble in [
@@ -554,14 +479,6 @@ def test_what_is_thinner_than_the_support_and_sharp_edges_are_told_and_kept(tmp_
         read(written(tmp_path, trimesh.convex.convex_hull(wedge)))
 
 
-def test_thickness_is_that_of_the_thinnest_sheet():
-    thick, thin = box([0, 0, 0], [1, 1, 0.3]), box([0, 0, 0.6], [1, 1, 0.64])
-    found = thickness_of(solid(joined(thick, thin)), 0.1)
-    assert found.thinnest == pytest.approx(0.04, abs=1e-5)
-    assert found.share(found.is_sheet) == pytest.approx(2.0 / (2 * 2 + 4 * 0.34), abs=0.01)
-    assert thickness_of(solid(thick), 0.1).thinnest == np.inf
-
-
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb", ".gltf"])
 @pytest.mark.parametrize(
     "content", [b"", b"rubbish\n\x00\xff" * 20, b"solid x\nendsolid x\n", b"v 0 0 0\nf 1 2 9\n", b"{}"]
@@ -575,7 +492,7 @@ def test_files_of_rubbish_are_a_sentence(tmp_path, suffix, content, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("cut", [0.02, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("cut", [0.2, 0.9])
 def test_files_that_are_cut_off_are_a_sentence(tmp_path, cut):
     for name in ("a.stl", "a.ply", "a.glb"):
         content = Path(written(tmp_path, box([0, 0, 0], [1, 1, 1]), name)).read_bytes()
@@ -585,19 +502,3 @@ def test_files_that_are_cut_off_are_a_sentence(tmp_path, cut):
 
 
 # ---- a large one -------------------------------------------------------------------------------------------------
-def test_two_hundred_thousand_triangles_are_read_sampled_and_asked_a_million_times(tmp_path):
-    """In seconds of one core, compiling left out."""
-    solid(torus(20, 12)).holds(cloud(10))
-    path, points = written(tmp_path, torus(500, 200)), np.random.default_rng(2).uniform(-0.4, 0.4, (1_000_000, 3))
-    begin = time.process_time()
-    mesh = read_mesh(path, 1.0, 0.01, 0.026, ROOM)
-    spent = [time.process_time() - begin]
-    found = mesh.distance_up_to(points, 0.03)
-    spent.append(time.process_time() - begin)
-    wall = surface_points(mesh, 0.01, 0.005)
-    spent.append(time.process_time() - begin)
-    assert len(mesh.triangles) == 200_000
-    exact = from_torus(points)
-    np.testing.assert_allclose(found, np.clip(exact, -0.03, 0.03), atol=3e-5)
-    assert len(wall.points) > 8000
-    assert spent[-1] < 20.0, spent

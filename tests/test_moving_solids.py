@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 
 import cortado
-from cortado import DivergedError, InputError, Problem, Scene, SceneError, Simulation, Trajectory, certify
-from cortado.gradients import AdjointViscosity
-from cortado.losses import CentreOfMass
-from cortado.pictures.film import ShownRun
-from cortado.pictures.run_pictures import run_page
+from cortado import DivergedError, InputError, Scene, SceneError, Simulation, Trajectory
 from cortado.scene.discrete_scene import discretise
-from cortado.scene.motions import greatest_speed
 from cortado.scene.scene_warnings import standing_sentences
-from cortado.scene.stability import stability_limits
 from cortado.scene.tables import rotation_matrix
 from scenes import box, jet, pool
 
@@ -37,7 +31,6 @@ def space(**tables):
 
 
 def walls_of(simulation):
-    """Those that move, as the device has them: places, feet, velocities and weights."""
     search = simulation.solver.search
     first = np.count_nonzero(simulation.solver.search.walls["wall_weights"].numpy()) - search.moving._own["count"]
     names = ("wall_positions", "wall_feet", "wall_velocities", "wall_weights")
@@ -126,10 +119,9 @@ def test_a_plate_that_starts_to_slide_draws_fluid_along_as_it_should(across):
         assert np.abs(v[:, 0] - exact).max() < {20: 0.03, 40: 0.01}[across]
 
 
-@pytest.mark.parametrize("thickness", [2.0, 3.0])
-def test_a_thin_plate_draws_fluid_along(thickness):
+def test_a_thin_plate_draws_fluid_along():
     """Its far side lies within the support of the fluid, and must not drive it."""
-    run = Simulation(sliding_plate(10, thickness, 0.001)).run(1000)
+    run = Simulation(sliding_plate(10, 2.0, 0.001)).run(1000)
     assert np.polyfit(run.positions[-1][:, 1], run.velocities[-1][:, 0], 1)[0] == pytest.approx(1.0, abs=0.06)
 
 
@@ -141,31 +133,6 @@ def test_a_belt_moves_fluid_and_stays():
     near = run.positions[-1][:, 1] < 0.05
     far = run.positions[-1][:, 1] > 0.25
     assert run.velocities[-1][near, 0].mean() > 0.4 > run.velocities[-1][far, 0].mean() + 0.2
-
-
-def test_a_certificate_and_an_estimator_beside_a_rotor():
-    simulation = Simulation(plane(ROTOR), precision="float64")
-    moving = simulation.run(60)
-    given = {"initial_positions": moving.positions[-1], "initial_velocities": moving.velocities[-1]}
-    problem = Problem(simulation, 20, CentreOfMass([0.5, 0.3]))
-    assert certify(problem, given).right
-    exact, viscous = (
-        problem.value_and_gradient({"gravity": [0.0, -9.81]}, gradient=one)[1]["gravity"]
-        for one in (None, AdjointViscosity())
-    )
-    assert exact @ viscous > 0.99 * np.linalg.norm(exact) * np.linalg.norm(viscous)
-
-
-def test_steps_that_are_chosen_know_how_fast_solids_are():
-    fast = {**ROTOR, "angular_velocity": 60.0, "velocity": None}
-    scene = plane(fast)
-    speed = 60.0 * np.hypot(0.1, 0.05)
-    assert greatest_speed(scene.solid, {}) == pytest.approx(speed)
-    assert greatest_speed(scene.solid, {"rotor.velocity": [3.0, 4.0]}) == pytest.approx(speed + 5.0)
-    assert stability_limits(scene)["the speed of solids"] == pytest.approx(0.2 * 0.05 / speed)
-    chosen = plane(fast, solver={"kind": "projection", "time_step": "auto"})
-    run = Simulation(chosen).run(20)
-    assert np.diff(run.times).max() <= 0.2 * 0.05 / speed * (1.0 + 1e-5)
 
 
 RESTING = box([0.2, 0.55], [0.4, 0.75], name="block", motion="path", times=[0.0, 0.3, 0.302])
@@ -206,7 +173,6 @@ def test_what_turns_and_a_nozzle_bound_the_steps_that_are_chosen():
 
 
 def test_scenes_of_a_batch_have_the_steps_of_their_own_paths():
-    """One of them is told where its solid is, step by step, which its path does not bound then."""
     scene = plane(RESTING, solver={"kind": "projection", "time_step": "auto"})
     one, several = Simulation(scene), Simulation(scene, batch=2)
     scales = np.array([1.0, 1.4])
@@ -227,12 +193,6 @@ def test_a_path_that_jumps_is_one_step_and_said(length):
     assert len(run.times) < 300 and run.times[-1] >= 0.2
     with pytest.warns(cortado.CortadoWarning, match=r"'block' goes 0\.3 m in step 2 of this run, which is further"):
         simulation.run(3, {"block.displacement": [[0.0, 0.0], [0.3, 0.0], [0.3, 0.0]]})
-
-
-def test_a_path_bounds_all_steps_where_nothing_else_does():
-    tables = {"container": box([0.0, 0.0], [1.0, 1.0]), "solver": {"kind": "pcisph", "time_step": "auto"}}
-    scene = plane(RESTING, **tables, forces={"gravity": [0.0, 0.0], "viscosity": "none"})
-    assert Simulation(scene).run(2).times[1] == pytest.approx(0.2 * 0.05 / 100.0)
 
 
 def test_what_a_solid_runs_into_is_lost_and_said(monkeypatch):
@@ -257,14 +217,10 @@ NO_SPEEDS = {"velocity": None, "angular_velocity": None}
     [
         ({"motion": "fixed"}, 'left out, as motion is "fixed"'),
         (NO_SPEEDS, "given, or times with positions"),
-        ({"velocity": [1.0, 0.0, 0.0]}, "a list of 2 components"),
         ({"angular_velocity": [0.0, 0.0, 1.0]}, "one number in 2-D"),
-        ({"times": [0.0, 1.0], "rotations": [0.0, 0.5]}, "left out, as there are times"),
         ({**NO_SPEEDS, "times": [0.1, 1.0]}, "given, or rotations, as there are times"),
         ({**NO_SPEEDS, "times": [0.1, 1.0], "rotations": [0.0, 0.5]}, "from 0 on"),
-        ({**NO_SPEEDS, "positions": [[0.0, 0.0]]}, "a list of times"),
         ({**NO_SPEEDS, "times": [0.0, 1.0], "positions": [[0.0, 0.0], [1.0, 0.0]]}, "where its middle is at the start"),
-        ({**NO_SPEEDS, "times": [0.0, 1.0], "rotations": [0.1, 0.2]}, "0, as it is not turned yet"),
         ({**NO_SPEEDS, "times": [0.0, 1.0], "rotations": [0.0]}, "a list of 2, as are times"),
     ],
 )
@@ -283,37 +239,16 @@ def test_a_path_is_written_and_read_and_a_solid_that_no_run_moved_is_a_sentence(
     assert "paddle" not in run.solids
 
 
-def test_pictures_and_films_show_solids_where_they_are(tmp_path):
-    """Also those of a run that was read from its file."""
-    simulation = Simulation(plane({**ROTOR, "colour": [0.9, 0.2, 0.05]}, picture={"width": 320, "height": 320}))
-    run = simulation.run(120, record_every=60)
-    run.save(tmp_path / "run.vtkhdf")
-    read = Trajectory.load(tmp_path / "run.vtkhdf")
-    pages = [run_page(ShownRun(simulation.scene, one), "cpu") for one in (run, read)]
-    films = [np.array(list(page.images([0, 1, 2]))) for page in pages]
-    np.testing.assert_array_equal(films[0], films[1])
-    np.testing.assert_array_equal(films[0][2], simulation.picture(run[2]))
-
-    def middle(image):
-        """Of what is red, in pixels."""
-        return np.argwhere(image[..., 0] > 2.0 * image[..., 2]).mean(axis=0)
-
-    (down, right), there = middle(films[0][2]) - middle(films[0][0]), run.solids["rotor"].positions
-    moved = there[2] - there[0]
-    assert right > 3.0 and down < -1.0 and right / -down == pytest.approx(moved[0] / moved[1], rel=0.3)
-
-
 @pytest.mark.parametrize(
     ("lower", "motion", "told"),
     [
-        (0.0, {"velocity": [0.1, 0.0]}, ["y = 0 m"]),
         (-0.02, {"velocity": [0.1, 0.0]}, ["y = 0 m"]),
         (-0.06, {"velocity": [0.1, 0.0]}, []),
         (0.0, {"velocity": [0.0, 0.1]}, []),
         (0.0, {"times": [0.0, 1.0], "positions": [[0.3, 0.25], [0.5, 0.25]]}, ["y = 0 m"]),
         (0.0, {"velocity": [0.1, 0.0], "angular_velocity": 0.1}, []),
     ],
-    ids=["piston", "too little", "through the floor", "gate", "on a path", "turns"],
+    ids=["too little", "through the floor", "gate", "on a path", "turns"],
 )
 def test_a_solid_that_moves_along_a_wall_and_ends_on_it_is_told(lower, motion, told):
     piston = box([0.2, lower], [0.4, 0.5 - lower], name="piston", motion="path", **motion)

@@ -63,10 +63,7 @@ def spring(x_ij, v_ij, k):
 
 
 FORCES = {"forces of one's own": [forces.Body(swirl, rate=2.0), forces.Pair(spring, k=3.0)]}
-ESTIMATORS = {
-    "exact": gradients.Exact(),
-    "adjoint viscosity": gradients.AdjointViscosity(5.0),
-}
+ESTIMATORS = {"exact": gradients.Exact(), "adjoint viscosity": gradients.AdjointViscosity(5.0)}
 CORES_AND_PARTS = ((2, 2), (2, 8), (5, 5))
 """All of them in the first case, and one of them in each of the others, in turn: how launches are cut does not depend
 on the kernel."""
@@ -83,7 +80,6 @@ class Seen(Weighed):
 
 
 def results(name) -> dict[str, bytes]:
-    """Bits of a short run of a disturbed start, of tangents, and of gradients by every estimator."""
     simulation = Simulation(CASES[name](), precision="float64", forces=FORCES.get(name, []))
     problem, random = Problem(simulation, STEPS, Weighed(simulation)), np.random.default_rng(2)
     point = simulation.parameters()
@@ -106,7 +102,6 @@ def results(name) -> dict[str, bytes]:
 
 
 def set_parts(monkeypatch, cores, parts, particles):
-    """Launches over so many particles are cut into so many ranges from now on."""
     monkeypatch.setattr(launching, "LEAST_PART", particles // parts)
     monkeypatch.setattr(launching, "LEAST_SHARED_PART", particles // parts if parts > cores else particles)
     monkeypatch.setattr(launching, "usable_cores", lambda: cores)

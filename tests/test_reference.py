@@ -42,12 +42,8 @@ TERMS = [Terms(), *(Terms(**{name: False}) for name in ("viscosity", "pressure",
 
 
 def point_and_direction(simulation, steps, seed=0, off_lattice=0.001):
-    """All parameters at once, off the lattice, whose symmetry puts many particles near the clamp's kink together.
-
-    Each coordinate of a particle is moved off it by about ``off_lattice`` [m].
-    """
+    """All parameters at once, so far off the lattice [m], whose symmetry puts many particles near the clamp's kink."""
     random, shape = np.random.default_rng(seed), simulation.positions.shape
-
     noise, size = random.standard_normal, np.sqrt(shape[0])
     point = {
         "gravity": np.tile(simulation.scene.forces.gravity, (steps, 1)),
@@ -87,21 +83,14 @@ def gradients_agree(simulation, point, steps, tolerance):
     return problem
 
 
-# ---- against the Warp engine ---------------------------------------------------------------------------------------
 @scenes
-def test_positions_are_those_of_the_warp_engine(made):
-    steps = 100 if made is SCENES["splash"] else 40
-    wanted, found = Simulation(made, precision="float64").run(steps), reference.Simulation(made).run(steps)
+def test_positions_and_derivatives_are_those_of_the_warp_engine(made):
+    steps, simulation = 100 if made is SCENES["splash"] else 40, reference.Simulation(made)
+    wanted, found = Simulation(made, precision="float64").run(steps), simulation.run(steps)
     assert distance(wanted.positions[-1], found.positions[-1]) < 1e-9
     assert np.array_equal(wanted.iterations, found.iterations)
     np.testing.assert_allclose(wanted.density_errors, found.density_errors, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(wanted.times, found.times)
-
-
-@scenes
-def test_derivatives_are_those_of_the_warp_engine(made):
-    steps = 100 if made is SCENES["splash"] else 40
-    simulation = reference.Simulation(made)
     point, directions = point_and_direction(simulation, steps)
     problem = gradients_agree(simulation, point, steps, 1e-8)
     tangent = simulation.tangent(point, directions, steps)
@@ -111,10 +100,7 @@ def test_derivatives_are_those_of_the_warp_engine(made):
 
 
 def test_float32_is_as_near_to_float64_as_the_warp_engine_is():
-    """In the median of nine starts: now and then a particle is at the clamp's kink to round-off, in either engine.
-
-    Nearer to the lattice that happens in most starts: all particles without free surface have the rest density there.
-    """
+    """In the median of nine starts: now and then a particle is at the clamp's kink to round-off, in either engine."""
     exact, single = reference.Simulation(splash()), reference.Simulation(splash(), "float32")
     loss = reference.FinalPositions(target_of(exact))
     problem = Problem(Simulation(splash(), precision="float32"), 40, losses.FinalPositions(loss.target))
@@ -133,7 +119,6 @@ def test_float32_is_as_near_to_float64_as_the_warp_engine_is():
         assert own < 1e-4, name
 
 
-# ---- methods against each other ------------------------------------------------------------------------------------
 @scenes
 @pytest.mark.parametrize("method", ["dual", "complex_step"])
 def test_methods_agree_in_float64(made, method):
@@ -155,32 +140,12 @@ def quadruple(request):
     return simulation, point, directions, simulation.tangent(point, directions, 200, record_every=50)
 
 
-@pytest.mark.parametrize("method", ["dual", "complex_step"])
-def test_methods_agree_in_float128(quadruple, method):
-    simulation, point, directions, exact = quadruple
-    point, directions = ({**values, "gravity": values["gravity"][:50]} for values in (point, directions))
-    other = simulation.tangent(point, directions, 50, method=method, record_every=50)
-    assert distance(other.position_tangents[1], exact.position_tangents[1]) < 1e-28
-    assert distance(other.velocity_tangents[1], exact.velocity_tangents[1]) < 1e-28
-
-
 def test_the_tangent_is_the_limit_of_differences_in_float128(quadruple):
     simulation, point, directions, exact = quadruple
     differences = {"method": "finite_difference", "difference": 1e-12, "record_every": 50}
     found = simulation.tangent(point, directions, 200, **differences).position_tangents
     for frame in (1, 2, 4):
         assert distance(found[frame], exact.position_tangents[frame]) < 1e-12
-
-
-@pytest.mark.parametrize("precision", ["float32", "float80", "float128"])
-def test_precisions_agree(precision):
-    if precision not in reference.precisions():
-        pytest.skip("the compiler does not have it")
-    exact, other = reference.Simulation(splash()), reference.Simulation(splash(), precision)
-    point, directions = point_and_direction(exact, 40, seed=1)  # with 0 a particle is at the clamp's kink in float32
-    wanted, found = (one.tangent(point, directions, 40) for one in (exact, other))
-    limit = 1e-3 if precision == "float32" else 1e-11
-    assert 0.0 < distance(found.position_tangents[-1].high, wanted.position_tangents[-1].high) < limit
 
 
 @scenes
@@ -209,7 +174,6 @@ def test_terms_make_a_difference():
     np.testing.assert_allclose(free.position_tangents.high[-1], np.broadcast_to(falling, (125, 3)), rtol=1e-12)
 
 
-# ---- the report's equations as they are printed --------------------------------------------------------------------
 @pytest.mark.parametrize("method", ["as_printed", "as_printed_right_viscosity", "as_printed_predicted_density"])
 def test_printed_equations_against_numpy(method):
     """One step with one iteration, compressed, in free space; the twin differentiates factors by complex step."""
@@ -262,7 +226,6 @@ def test_printed_equations_against_numpy(method):
     assert distance(found.position_tangents.high[-1], dx + dt * dv_new) < 1e-12
 
 
-# ---- bits, digits, histories ---------------------------------------------------------------------------------------
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_same_bits_with_any_number_of_threads(precision):
     found = []
@@ -304,53 +267,27 @@ def test_a_history_has_every_step():
 
 
 def test_an_observer_may_stop_a_run():
-    class Enough(Exception):
-        pass
-
-    def stop(step):
-        if step == 3:
-            raise Enough
-
-    with pytest.raises(Enough):
-        reference.Simulation(plane()).run(10, observe=stop)
+    with pytest.raises(ZeroDivisionError):
+        reference.Simulation(plane()).run(10, observe=lambda step: 1 / (3 - step))
 
 
-# ---- mistakes ------------------------------------------------------------------------------------------------------
-def stirred(motion, **changes):
-    """A simulation of the splash with a block below it that moves."""
-    block = box([0.25, 0.0, 0.05], [0.4, 0.1, 0.2], name="block", motion=motion, **changes)
-    return reference.Simulation(scene(solid=[block], solver={"kind": "projection", "time_step": 0.001}))
-
-
-def as_printed(name):
-    return reference.Simulation(SCENES[name]).tangent({}, {}, 5, method="as_printed")
+BLOCK = box([0.25, 0.0, 0.05], [0.4, 0.1, 0.2], name="block", motion="path", velocity=[0.1, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
     "call, sentence",
     [
         (lambda s: s.run(0), "steps is 0, but must be a whole number of at least 1."),
-        (lambda s: s.run(5, record_every=0), "record_every is 0"),
         (lambda s: s.run(5, {"gravity": [0.0, 1.0]}), r"gravity has shape \(2,\), but must be \(3,\) or \(5, 3\)"),
-        (lambda s: s.run(5, {"gravity": [0.0, np.nan, 1.0]}), "gravity has a value that is not finite"),
-        (lambda s: s.run(5, {"viscosity": -1.0}), "viscosity is -1.0, but must be at least 0"),
         (lambda s: s.run(5, {"time_step": 0.1}), "'time_step' is unknown to the reference engine, but must be one of"),
-        (lambda s: s.run(5, {"initial_positions": np.zeros((3, 3))}), r"initial_positions has shape \(3, 3\)"),
-        (lambda s: s.run(5, {"gravity": "down"}), "gravity is 'down', but must be a number or an array"),
         (lambda s: s.tangent({}, {}, 5, method="magic"), "method is 'magic', but must be one of analytic, dual"),
         (lambda s: s.tangent({}, {}, 5, method="dual", terms=Terms()), "only analytic has them"),
         (lambda s: s.tangent({}, {}, 5, method="finite_difference", difference=0.0), "difference is 0.0, but must be"),
         (lambda s: s.tangent({}, {"viscosity": 1.0}, 5, method="as_printed"), "no such derivative"),
         (lambda s: s.gradient({}, 5, reference.FinalPositions(np.zeros((2, 3)))), r"target has shape \(2, 3\)"),
         (lambda s: reference.Simulation(splash(), "float16"), "precision is 'float16', but must be one of float32"),
-        (lambda s: reference.Simulation(splash(), threads=0), "threads is 0"),
-        (lambda s: reference.Simulation(3), "must be a cortado.Scene or the path of a scene file"),
         (lambda s: reference.Simulation(two_layers()), "several phases or an emitter"),
-        (lambda s: stirred("path", velocity=[0.1, 0.0, 0.0]), r"solid\[0\], which moves, but must"),
-        (lambda s: stirred("fixed", surface_velocity=[0.1, 0.0, 0.0]), r"solid\[0\], which moves"),
-        (lambda s: stirred("free", density=500.0), r"solid\[0\], which moves, but must have"),
-        (lambda s: as_printed("stress, no slip"), "must not be used with the stress viscosity"),
-        (lambda s: as_printed("stress, periodic"), "must not be used with the stress viscosity"),
+        (lambda s: reference.Simulation(scene(solid=[BLOCK])), r"solid\[0\], which moves, but must"),
     ],
 )
 def test_a_mistake_gives_a_sentence(call, sentence):

@@ -14,15 +14,11 @@ from cortado.discretise.smoothing import (
     RATE_LIMIT,
     SLACK,
     greatest_rate,
-    lattice_offsets,
     pressure_stiffness,
     rest_volume,
-    smoothing_kernel,
     wall_response,
 )
 from cortado.discretise.smoothing_functions import smoothing_functions
-from cortado.errors import InputError
-from finite_differences import decades, plateau
 
 SUPPORT = 0.13
 SPACING = 0.05
@@ -93,20 +89,12 @@ def evaluator(kernel, precision):
     functions = smoothing_functions(kernel, precision)
     weight, gradient = functions.weight, functions.gradient
     slope, slope_change = functions.slope, functions.slope_change
-    real, vector = precision.real, precision.vector
+    real, numbers, vectors = precision.real, wp.array(dtype=precision.real), wp.array(dtype=precision.vector)
     module = wp.get_module(f"test_smoothing_{kernel.name}_{precision.name}")
     module.options.update({"enable_backward": False, "optimization_level": 1})
 
     @wp.kernel(module=module, enable_backward=False)
-    def evaluate(
-        x: wp.array(dtype=vector),
-        u: wp.array(dtype=vector),
-        per_h: real,
-        sigma: real,
-        w: wp.array(dtype=real),
-        g: wp.array(dtype=vector),
-        hu: wp.array(dtype=vector),
-    ):
+    def evaluate(x: vectors, u: vectors, per_h: real, sigma: real, w: numbers, g: vectors, hu: vectors):
         i = wp.tid()
         w[i] = weight(x[i], per_h, sigma)
         g[i] = gradient(x[i], per_h, sigma)
@@ -168,46 +156,11 @@ def test_warp_forms_against_the_formulae(name, dimension, precision):
     np.testing.assert_allclose(hu, expected, atol=20 * accuracy * size / SUPPORT**2)
 
 
-def away_from_joints(name, x):
-    """Without separations near a joint of pieces, where W'' or W''' jumps."""
-    q = np.linalg.norm(x, axis=1) / SUPPORT
-    joints = np.array([0.0] + [upper for _, upper, _ in PIECES[name]])
-    return (np.abs(q[:, None] - joints) > 0.02).all(axis=1)
-
-
-@kernels
-def test_warp_forms_against_central_differences(name, dimension):
-    x, u = separations(dimension)
-    _, g, hu = evaluate(name, FLOAT64, dimension, x, u)
-    smooth = away_from_joints(name, x)
-    slopes, bends = [], []
-    for h in SUPPORT * decades(2.5, 7.0):
-        ahead, behind = (evaluate(name, FLOAT64, dimension, x + sign * h * u, u) for sign in (1, -1))
-        slope, bend = ((a - b) / (2 * h) for a, b in zip(ahead[:2], behind[:2], strict=True))
-        slopes.append(np.abs(slope - (g * u).sum(axis=1))[smooth].max())
-        bends.append(np.abs(bend - hu)[smooth].max())
-    assert plateau(slopes) < 1e-8 * np.abs(g).max()
-    assert plateau(bends) < 1e-8 * np.abs(hu).max()
-
-
-@kernels
-@precisions
-def test_coincident_particles(name, dimension, precision):
-    u = np.array([[1.0, 0.0, 0.0], [0.3, -0.4, 0.0], [0.0, 0.0, 0.0]])
-    w, g, hu = evaluate(name, precision, dimension, np.zeros((3, 3)), u)
-    size = sigma(name, dimension)
-    np.testing.assert_allclose(w, size, rtol=ACCURACY[precision.name])
-    np.testing.assert_array_equal(g, 0.0)
-    bend = size / SUPPORT**2 * radial(name, 0.0, 2)
-    assert bend < 0.0
-    np.testing.assert_allclose(hu, bend * u, rtol=ACCURACY[precision.name])
-
-
 @names
 @precisions
-@pytest.mark.parametrize("exponent", [-6, -12, -20, -30, -100, -250])
+@pytest.mark.parametrize("exponent", [-6, -20, -100, -400])
 def test_nearly_coincident_particles(name, precision, exponent):
-    """Down to numbers that underflow: all is finite, and near the limit at r = 0."""
+    """Down to numbers that underflow, and to 0: all is finite, and near the limit at r = 0."""
     x = np.array([[1.0, -2.0, 0.5]]) * 10.0**exponent
     u = np.array([[0.3, 0.4, -0.6]])
     w, g, hu = evaluate(name, precision, 3, x, u)
@@ -225,12 +178,6 @@ def test_beyond_the_support_all_is_zero(name, dimension, precision):
     for q in (1.00001, 1.03, 1.5, 10.0, 1e6):
         for found in evaluate(name, precision, dimension, q * SUPPORT * directions, u):
             np.testing.assert_array_equal(found, 0.0)
-
-
-def test_a_kernel_by_name():
-    assert smoothing_kernel("wendland_c2") is KERNELS["wendland_c2"]
-    with pytest.raises(InputError, match=r"'gauss'.*cubic_spline, wendland_c2, wendland_c4"):
-        smoothing_kernel("gauss")
 
 
 def block(dimension, n=9):
@@ -255,24 +202,6 @@ def test_the_lattice_has_the_rest_density_less_the_slack(name, dimension, suppor
     assert density == pytest.approx(1.0 - SLACK, rel=1e-12)
     assert volume == pytest.approx(SPACING**dimension, rel=0.2)
     assert 0.0 < SLACK <= 1e-3
-
-
-@pytest.mark.parametrize("name, support", [("cubic_spline", 2.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0)])
-def test_a_stretched_square_lattice_is_denser_and_a_sheared_one_need_not_be(name, support):
-    """At constant area in 2-D. A stretch along the rows raises the number density, the more the greater it is. The
-    square lattice is no minimum all the same: sheared along its rows by half a spacing, and hexagonal, it is less
-    dense, by less than 0.4 %."""
-
-    def density(strained):
-        offsets = lattice_offsets(1.0, 2.0 * support, 2) @ np.transpose(strained)
-        return KERNELS[name].weight(np.linalg.norm(offsets, axis=1), 2, support).sum()
-
-    square = density(np.eye(2))
-    stretches = [density(np.diag(np.exp([a, -a]))) / square for a in np.linspace(0.0, 0.5, 26)]
-    assert (np.diff(stretches) > 0.0).all()
-    side = np.sqrt(2.0 / np.sqrt(3.0))
-    sheared, hexagonal = [[1.0, 0.5], [0.0, 1.0]], [[side, side / 2.0], [0.0, 1.0 / side]]
-    assert 0.996 < density(hexagonal) / square < density(sheared) / square < 1.0
 
 
 @kernels
@@ -310,25 +239,6 @@ def test_the_pressure_iteration_converges_on_the_lattice(name, dimension, suppor
     assert 0.5 < rates.max() < 1.01 * RATE_LIMIT < 2.0
     rate = greatest_rate(kernel, SPACING, support, dimension) * lowered(name, support, dimension)
     assert 0.8 * rate < rates.max() < 1.01 * rate
-
-
-@kernels
-@supports
-def test_pressure_stiffness_answers_an_error_with_its_correction(name, dimension, support):
-    """What delta means (Solenthaler and Pajarola 2009): one pressure p at a particle and its neighbours, acting from it
-    on them and back, moves them so that its density falls by p / delta."""
-    support *= SPACING
-    kernel, time_step = KERNELS[name], 1e-3
-    volume = rest_volume(kernel, SPACING, support, dimension)  # rho_0 = 1
-    points, middle = block(dimension)
-    p = 1e-9
-    gradients = kernel.gradient(points[middle] - points, support)
-    moved = time_step**2 * 2 * p * volume * gradients
-    moved[middle] = -(time_step**2) * 2 * p * volume * gradients.sum(axis=0)
-    change = volume * (gradients * (moved[middle] - moved)).sum()
-    stiffness = pressure_stiffness(kernel, SPACING, support, dimension) / lowered(name, support, dimension)
-    delta = stiffness / time_step**2
-    assert change == pytest.approx(-p / delta, rel=1e-9)
 
 
 def test_the_polynomials_of_this_file_have_their_textbook_normalisations():

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from cortado import CortadoWarning, DivergedError, InputError, Problem, SceneError, Simulation
-from cortado.losses import CentreOfMass
+from cortado import CortadoWarning, DivergedError, InputError, SceneError, Simulation
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.solid_shapes import BoxSolid, CapsuleSolid, CupSolid, CylinderSolid, PolygonSolid, SphereSolid
 from cortado.scene.solids import solids_of
-from finite_differences import both_modes, central_difference
 from held_water import cup_turned, meshes, stirred
 from scenes import box, pool
 from test_packing import densities
@@ -17,30 +15,19 @@ AT = {"name": "a", "base": [0.1, 0.2, 0.3], "radius": 0.4}
 SOLIDS = {
     "rectangle": (BoxSolid(name="a", lower=[0.0, 0.1], upper=[1.0, 0.6], rotation=0.3), 0.5),
     "disc": (SphereSolid(name="a", centre=[0.3, 0.2], radius=0.5), np.pi * 0.25),
-    "flat capsule": (
-        CapsuleSolid(name="a", start=[0.0, 0.0], end=[0.5, 0.8], radius=0.3),
-        np.pi * 0.09 + 0.6 * np.sqrt(0.89),
-    ),
-    "flat cup": (
-        CupSolid(**{**AT, "base": [0.1, 0.2]}, height=0.9, thickness=0.2, rotation=-0.4),
-        1.2 * 0.9 - 0.8 * 0.7,
-    ),
-    "polygon": (
-        PolygonSolid(name="a", corners=[[0.0, 0.0], [0.2, 0.9], [0.4, 0.3], [1.0, 0.1]], position=[0.5, 0.5]),
-        0.28,
-    ),
+    "flat capsule": (CapsuleSolid(name="a", start=[0.0, 0.0], end=[0.5, 0.8], radius=0.3),
+                     np.pi * 0.09 + 0.6 * np.sqrt(0.89)),
+    "flat cup": (CupSolid(**{**AT, "base": [0.1, 0.2]}, height=0.9, thickness=0.2, rotation=-0.4), 0.52),
+    "polygon": (PolygonSolid(name="a", corners=[[0.0, 0.0], [0.2, 0.9], [0.4, 0.3], [1.0, 0.1]], position=[0.5, 0.5]),
+                0.28),
     "box": (BoxSolid(name="a", lower=[0.0, 0.1, 0.0], upper=[1.0, 0.6, 0.7], rotation=[0.3, -0.2, 0.5]), 0.35),
     "sphere": (SphereSolid(name="a", centre=[0.3, 0.2, 0.1], radius=0.5), np.pi / 6.0),
-    "capsule": (
-        CapsuleSolid(name="a", start=[0.0, 0.0, 0.1], end=[0.5, 0.8, 0.3], radius=0.3),
-        np.pi * (0.036 + 0.09 * np.sqrt(0.93)),
-    ),
+    "capsule": (CapsuleSolid(name="a", start=[0.0, 0.0, 0.1], end=[0.5, 0.8, 0.3], radius=0.3),
+                np.pi * (0.036 + 0.09 * np.sqrt(0.93))),
     "cylinder": (CylinderSolid(**AT, height=0.7, axis="x", rotation=[0.1, 0.0, 0.4]), np.pi * 0.16 * 0.7),
-    "cup": (
-        CupSolid(**AT, height=0.9, thickness=0.2, axis="z", rotation=[0.5, 0.0, 0.0]),
-        np.pi * (0.36 * 0.9 - 0.16 * 0.7),
-    ),
-}
+    "cup": (CupSolid(**AT, height=0.9, thickness=0.2, axis="z", rotation=[0.5, 0.0, 0.0]),
+            np.pi * (0.36 * 0.9 - 0.16 * 0.7)),
+}  # fmt: skip
 """Each with its area or its volume."""
 
 
@@ -103,12 +90,10 @@ def scene(solids, dimension=2, kind="projection", spacing=0.05, **tables):
 
 
 def energies_of(run):
-    """Of a run, in each frame, over the mass."""
     return (0.5 * (run.velocities**2).sum(axis=-1) + 9.81 * run.positions[..., 1]).mean(axis=1)
 
 
 def deepest(run, one):
-    """The least distance of a particle of a run from the solid of its scene [m], which is negative in it."""
     (solid,) = solids_of(one.solid)
     return min(solid.distance(x.astype(float)).min() for x in run.positions)
 
@@ -123,9 +108,7 @@ OBSTACLES = {"pillar": PILLAR, "leaning": LEANING, "disc": DISC, "sheet": SHEET,
 
 
 def full(table, **tables):
-    """A tank full of fluid around, or in, a solid."""
-    block = {"shape": "box", "lower": [0.0, 0.0], "upper": [1.0, 1.0], "phase": "water"}
-    return scene([table], fluid=[block], **tables)
+    return scene([table], fluid=[box([0.0, 0.0], [1.0, 1.0], phase="water")], **tables)
 
 
 TURNED_TANK = {"shape": "box", "lower": [0.2, 0.2], "upper": [0.8, 0.8], "rotation": 0.4, "side": "inside"}
@@ -134,7 +117,6 @@ TURNED_TANK = {"shape": "box", "lower": [0.2, 0.2], "upper": [0.8, 0.8], "rotati
 @pytest.mark.parametrize("kind", ["projection", "pcisph"])
 @pytest.mark.parametrize("table", [*OBSTACLES.values(), TURNED_TANK], ids=[*OBSTACLES, "turned tank"])
 def test_fluid_around_a_solid_starts_at_rest(table, kind):
-    """Within 1 %, wherever its faces are against the lattice."""
     one = full(table, kind=kind)
     found = densities(discretise(one))
     assert found.max() < 1.01 and found.min() > 0.99
@@ -176,7 +158,6 @@ def test_a_dam_break_against_a_solid_gains_no_energy_and_does_not_enter_it(name,
 
 @pytest.mark.parametrize("rotation", [0.0, 0.2, 0.785])
 def test_a_tank_may_be_turned(rotation):
-    """A block falls into it; no wall is along the lattice."""
     tank = box([-0.6, -0.5], [0.6, 0.5], rotation=rotation, side="inside")
     one = scene([tank], container={"shape": "none"}, fluid=[box([-0.25, -0.2], [0.25, 0.2], phase="water")])
     run = Simulation(one, precision="float64").run(1200, record_every=20)
@@ -184,32 +165,10 @@ def test_a_tank_may_be_turned(rotation):
     assert np.diff(energies).max() < 1e-3 * (energies[0] - energies[-1]) and deepest(run, one) > 0.0
 
 
-def test_a_cup_that_leans_holds_water():
-    cup = {"shape": "cup", "base": [0.5, 0.1, 0.5], "radius": 0.3, "height": 0.6, "thickness": 0.1}
-    water = {"shape": "cylinder", "base": [0.5, 0.2, 0.5], "radius": 0.3, "height": 0.25, "phase": "water"}
-    tables = {"container": {"shape": "none"}, "solver": {"kind": "projection", "time_step": 0.002}}
-    one = scene([{**cup, "rotation": [0.1, 0, 0.2]}], 3, fluid=[water], **tables)
-    run = Simulation(one).run(250, record_every=50)
-    assert deepest(run, one) > -0.5 * 0.05
-    assert run.positions[-1][:, 1].min() > 0.1  # nothing has fallen past it
-
-
-def test_what_enters_a_solid_is_lost_and_said(monkeypatch):
-    """With walls that weigh nothing."""
-    from cortado.discretise import walls
-
-    monkeypatch.setattr(walls, "uneven_changes", lambda sums, wanted: np.full(sums.shape[1], -1.0))
-    above = {"shape": "box", "lower": [0.5, 0.4], "upper": [0.7, 0.6], "phase": "water"}
-    shelf = {"shape": "box", "lower": [0.3, 0.1], "upper": [0.9, 0.35]}
-    with pytest.raises(DivergedError, match="entered the solid 'solid 0' and was at"):
-        Simulation(scene([shelf], fluid=[above])).run(400)
-
-
-@pytest.mark.parametrize("slips", [("no", "free"), ("free", "no")])
-def test_each_solid_has_its_own_slip(slips):
+def test_each_solid_has_its_own_slip():
     """A layer of fluid between two plates that slides along them is held back by the one without slip."""
     one = scene(
-        [box([0.0, low], [1.0, low + 0.2], slip=slip) for low, slip in zip((-0.2, 0.4), slips, strict=True)],
+        [box([0.0, low], [1.0, low + 0.2], slip=slip) for low, slip in zip((-0.2, 0.4), ("no", "free"), strict=True)],
         fluid=[box([0.0, 0.0], [1.0, 0.4], phase="water", velocity=[1.0, 0.0])],
         container=box([0.0, -0.5], [1.0, 1.0], periodic=[True, False]),
         phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 20.0}],
@@ -217,21 +176,8 @@ def test_each_solid_has_its_own_slip(slips):
     )
     run = Simulation(one, precision="float64").run(200)
     speeds = run.velocities[-1][:, 0]
-    low, high = speeds[run.positions[-1][:, 1] < 0.1].mean(), speeds[run.positions[-1][:, 1] > 0.3].mean()
-    held, free = (low, high) if slips[0] == "no" else (high, low)
-    assert held < 0.5 and free > 0.85
-
-
-@pytest.mark.parametrize("kind", ["projection", "pcisph"])
-def test_gradients_beside_a_solid(kind):
-    """Reverse and forward mode, and differences."""
-    simulation = Simulation(scene([LEANING], kind=kind), precision="float64")
-    moved = simulation.run(120)
-    problem = Problem(simulation, 20, CentreOfMass([0.5, 0.3]))
-    values = {"initial_positions": moved.positions[-1], "initial_velocities": moved.velocities[-1]}
-    along = {"initial_velocities": np.random.default_rng(2).normal(size=moved.velocities[-1].shape)}
-    _, tangent = both_modes(problem, values, along)
-    assert central_difference(problem.value, values, along, 1e-6) == pytest.approx(tangent, rel=1e-5)
+    y = run.positions[-1][:, 1]
+    assert speeds[y < 0.1].mean() < 0.5 and speeds[y > 0.3].mean() > 0.85
 
 
 @pytest.mark.parametrize(
@@ -239,29 +185,16 @@ def test_gradients_beside_a_solid(kind):
     [
         ({**PILLAR, "upper": [0.56, 0.3]}, "only 0.01 m thick"),
         ({**PILLAR, "rotation": [0.1, 0.2, 0.3]}, "one number in 2-D"),
-        ({**PILLAR, "position": [0.1, 0.2, 0.3]}, "a list of 2 components"),
-        ({**PILLAR, "upper": [0.5, 0.3]}, "greater than lower"),
-        ({"shape": "cylinder", "base": [0.0, 0.0], "radius": 0.1, "height": 0.2}, '"box", "sphere", "capsule"'),
         ({"shape": "polygon", "corners": [[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]}, "sides that do not cross"),
-        ({"shape": "polygon", "corners": [[0.0, 0.0], [1.0, 1.0]]}, "solid[0].corners"),
         ({"shape": "cup", "base": [0.5, 0.0], "radius": 0.2, "height": 0.1, "thickness": 0.2}, "less than height, 0.1"),
-        ({"shape": "cone"}, "solid[0].shape is 'cone'"),
         ({**DISC, "centre": [1e12, 0.0]}, "m from the origin"),
-        *(
-            ({"shape": "polygon", "corners": [[0.1 * k, 0.3] for k in range(count)]}, "at least 3 entries, each a list")
-            for count in (0, 1, 2)
-        ),
+        ({"shape": "polygon", "corners": [[0.1, 0.3], [0.2, 0.3]]}, "at least 3 entries, each a list"),
     ],
 )
 def test_a_bad_solid_is_a_sentence(table, sentence):
     with pytest.raises(SceneError) as error:
         scene([table])
     assert sentence in str(error.value) and "solid[0]" in str(error.value)
-
-
-def test_two_solids_of_one_name_are_refused():
-    with pytest.raises(SceneError, match="another name than those of the solids before"):
-        scene([{**PILLAR, "name": "a"}, {**DISC, "name": "a"}])
 
 
 @pytest.mark.parametrize(
@@ -285,7 +218,6 @@ def test_positions_in_a_solid_are_refused():
 
 
 def wall(thickness):
-    """From floor to lid beside the column, so many spacings thick."""
     return {"shape": "box", "lower": [0.4, -0.1], "upper": [0.4 + 0.05 * thickness, 1.1]}
 
 
@@ -334,7 +266,6 @@ def test_walls_hold_water_from_the_thickness_on_that_is_said():
 
 
 def sheet(lower, upper):
-    """From floor to lid, between two places, as a polygon, which may be half a spacing thick."""
     return {"shape": "polygon", "corners": [[lower, -0.1], [upper, -0.1], [upper, 1.1], [lower, 1.1]]}
 
 
@@ -362,17 +293,6 @@ def test_a_lining_thinner_than_a_spacing_has_the_wall_particles_of_what_is_behin
     np.testing.assert_allclose(layers(solids), layers([whole]), rtol=0.4)
 
 
-PISTON = ([{**wall(1.5), "motion": "path", "velocity": [-0.1, 0.0]}], 1.0)
-
-
-@pytest.mark.parametrize(("solids", "upper"), [LININGS["of the container"], PISTON], ids=["lining", "piston"])
-@pytest.mark.filterwarnings("ignore::cortado.CortadoWarning")
-def test_linings_and_walls_that_move_hold_water_too(solids, upper):
-    tables = {"container": box([0.0, 0.0], [upper, 1.0]), "solver": {"kind": "projection", "time_step": "auto"}}
-    run = Simulation(scene(solids, **tables)).run(80)
-    assert run.positions[-1, :, 0].max() < 0.4 + 0.25 * 0.05
-
-
 def test_a_paddle_stirs_and_nothing_enters_it():
     found = stirred(24, 560, thickness=0.14)
     assert found["turns"] > 0.6
@@ -392,5 +312,4 @@ def test_a_mesh_holds_water(name):
 
 
 def test_a_cup_without_a_bottom_holds_none():
-    found = meshes(100, "cup with a handle", bottom=False)
-    assert found["lowest"] < 0.0
+    assert meshes(100, "cup with a handle", bottom=False)["lowest"] < 0.0

@@ -24,20 +24,17 @@ RATES |= {"nozzle.path": 0.01, "nozzle.flow_rate": 0.01}
 
 
 def tense(**changes):
-    """A square of fluid that surface tension rounds."""
     forces, phase = {"gravity": [0.0, -9.81], "surface_tension": 20.0}, {"name": "water", "rest_density": 1000.0}
     return plane(**{"phase": [{**phase, "viscosity": 5.0}], "forces": forces, **changes})
 
 
 def tense_cube(**changes):
-    """Two fluids in space with a tension of their surface."""
     forces = {"gravity": [0.0, -9.81, 0.0], "surface_tension": 15.0}
     phases = [{**phase.model_dump(), "viscosity": 5.0} for phase in two_layers().phase]
     return two_layers(**{"phase": phases, "forces": forces, **changes})
 
 
 def curved(make=tense, **changes):
-    """A square, or a cube of two fluids, that surface tension by curvature rounds."""
     forces = {**changes.pop("forces", make().forces.model_dump()), "pressure": False}
     return make(**changes, forces=forces, solver=BY_CURVATURE)
 
@@ -47,12 +44,10 @@ def curved_cube(**changes):
 
 
 def miscible(make=two_layers, **changes):
-    """Fluids that mix in any share."""
     return make(**changes, mixture={**make().mixture.model_dump(), "free_energy": "miscible"})
 
 
 def three_miscible(**changes):
-    """Of three, with a mobility that depends on the fractions."""
     mixture = {**MIXING, "mobility": 0.03, "free_energy": "miscible"}
     return plane_of_three(**changes, mixture=mixture)
 
@@ -180,7 +175,6 @@ def test_tangents_and_adjoints_equal_complex_steps_of_the_twin(make, kernel, vis
     for name, one in zip(ADJOINT_FIELDS, wanted, strict=True):
         found = states[STEPS][name]
         assert np.linalg.norm(found - one) <= 1e-12 * np.linalg.norm(one)
-
     bars = [random.standard_normal(one.shape) for one in wanted]
     bar = rollout.solver.new_state()
     bar.set(dict(zip(ADJOINT_FIELDS, bars, strict=True)))
@@ -193,7 +187,6 @@ def test_tangents_and_adjoints_equal_complex_steps_of_the_twin(make, kernel, vis
 
 
 def prepared(make, kernel, viscosity, slip, precision):
-    """A simulation of one case."""
     original = make()
     made = make(
         discretisation={"spacing": 0.05, "support": 2.0 if kernel == "cubic_spline" else 2.6, "kernel": kernel},

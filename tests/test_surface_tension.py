@@ -7,17 +7,13 @@ import pytest
 from scipy.optimize import curve_fit
 from scipy.spatial import ConvexHull
 
-import cortado
-from cortado import CortadoWarning, Problem, Scene, Simulation, losses
-from cortado.optimisation.optimisers import Adam
-from cortado.render.renderer import scene_renderer
+from cortado import Scene, Simulation
 from scenes import bodies, box
 
 SIGMA, DENSITY, RADIUS = 0.07, 1000.0, 0.05
 
 
 def drop(dimension: int, across: int, ohnesorge: float = 0.1, **changes) -> Scene:
-    """A ball in free space, so many particles across."""
     spacing, mu = 2.0 * RADIUS / across, ohnesorge * float(np.sqrt(DENSITY * SIGMA * RADIUS))
     ball = {"shape": "sphere", "centre": [0.0] * dimension, "radius": RADIUS}
     time_step = 0.075 * float(np.sqrt(DENSITY * spacing**3 / SIGMA))
@@ -30,14 +26,11 @@ def drop(dimension: int, across: int, ohnesorge: float = 0.1, **changes) -> Scen
 
 
 def cube(dimension: int, across: int, **changes) -> Scene:
-    """A cube with so many particles along an edge."""
     half = across * RADIUS / 16
     return drop(dimension, 16, fluid=[box([-half] * dimension, [half] * dimension)], **changes)
 
 
 class Watch:
-    """What there was to see of a drop along a run."""
-
     def __init__(self, scene: Scene, periods: float, kick: float = 0.0):
         """``periods`` in sqrt(rho R^3 / sigma); a kick is an amplitude of the mode 2, over the radius."""
         self.scene, self.simulation = scene, Simulation(scene, precision="float64")
@@ -114,21 +107,9 @@ def test_the_pressure_jump_and_the_frequency_of_a_drop(dimension, across, error)
 
 @pytest.mark.parametrize(("dimension", "across"), [(2, 32), (3, 14)])
 def test_energy_does_not_grow(dimension, across):
-    """Kinetic energy and that of the convex hull's surface."""
     energy = kicked(dimension, across, 0.2).energy
     assert energy.max() < energy[0] + 0.005
     assert energy[-1] < energy[0]
-
-
-def test_hardly_any_viscosity_a_narrow_support_and_a_long_time_step_are_warned_of():
-    solver, square = drop(2, 8).solver.model_dump(), [box([0.0, 0.0], [RADIUS, RADIUS])]
-    for changes, words in [
-        ({"ohnesorge": 0.01}, "viscosity of phase 'water' is 0.0187083 Pa s"),
-        ({"discretisation": {"spacing": RADIUS / 4, "support": 1.5}, "fluid": square}, "support is 1.5"),
-        ({"solver": {**solver, "time_step": 1.2 * solver["time_step"]}}, "limit of stability"),
-    ]:
-        with pytest.warns(CortadoWarning, match=words):
-            Simulation(drop(2, 8, **changes))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -146,38 +127,3 @@ def test_walls_are_not_wetted():
     x = Watch(drop(2, 16, fluid=[body], container=room), periods=5.0).end["positions"]
     axes = np.sqrt(np.linalg.eigvalsh(np.cov(x.T)))
     assert axes[0] / axes[1] > 0.95
-
-
-def test_a_drop_across_a_periodic_boundary():
-    """Moves as one in free space does."""
-    body = {"shape": "sphere", "centre": [0.0, 2.0 * RADIUS], "radius": RADIUS}
-    room = box([-2.0 * RADIUS, 0.0], [2.0 * RADIUS, 4.0 * RADIUS], periodic=[True, False])
-    free, across = (
-        Simulation(drop(2, 12, fluid=[body], **change), precision="float64") for change in ({}, {"container": room})
-    )
-    assert np.abs(across.positions - free.positions).max() < 0.01 * RADIUS / 6  # packed alike, but for round-off
-    shift = {"initial_positions": free.positions + [2.0 * RADIUS, 0.0]}
-    shift["initial_positions"][:, 0] -= np.where(shift["initial_positions"][:, 0] > 2.0 * RADIUS, 4.0 * RADIUS, 0.0)
-    here, there = free.run(50).positions[-1], across.run(50, shift).positions[-1]
-    offset = there - here - [2.0 * RADIUS, 0.0]
-    offset[:, 0] -= np.rint(offset[:, 0] / (4.0 * RADIUS)) * 4.0 * RADIUS
-    assert np.abs(offset).max() < 1e-9 * RADIUS
-
-
-def test_surface_tension_is_found_from_frames():
-    """Of a drop that starts as a rectangle and oscillates, from pictures alone."""
-    tables = {"container": box([-0.09, -0.09], [0.09, 0.09]), "render": {"view": "plane", "resolution": [24, 24]}}
-    scene = drop(2, 10, fluid=[box([-0.06, -0.03], [0.06, 0.03])], **tables)
-    simulation = Simulation(scene, precision="float64")
-    renderer, colours = scene_renderer(simulation), np.array([scene.phase[0].colour])
-    steps, shown, pictures = 120, (40, 80, 120), {}
-
-    def take(step, state):
-        if step in shown:
-            pictures[step] = renderer.render(state.positions, state.mass_fractions, colours)
-
-    simulation.rollout(steps).forward(take, keep=False)
-    frames = losses.Frames({step: losses.Image(renderer, pictures[step]) for step in shown})
-    start = {"surface_tension": 0.6 * SIGMA}
-    found = cortado.optimise(Problem(simulation, steps, frames), start, Adam(learning_rate=0.003), iterations=30)
-    assert abs(float(found.parameters["surface_tension"]) / SIGMA - 1.0) < 0.05

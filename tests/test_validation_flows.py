@@ -1,5 +1,6 @@
 """Viscous flows, flows that pull and drops, against closed forms; `validation/README.md` says what was found."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -54,13 +55,10 @@ def test_a_square_that_turns_keeps_together():
     assert 0.98 < energy <= 1.0 and abs(turning - 1.0) < 0.005
 
 
-def test_an_ellipse_of_fluid_is_drawn_out_as_it_must():
+def test_an_ellipse_and_a_ball_of_fluid_are_drawn_out_as_they_must():
     """Monaghan (1994)."""
     assert abs(elliptical_drop(36) - 1.0).max() < 0.01
     assert abs(elliptical_drop(36, solver=PCISPH) - 1.0).max() > 0.05
-
-
-def test_so_is_a_ball():
     assert abs(elliptical_drop(14, 3) - 1.0).max() < 0.02
 
 
@@ -69,11 +67,6 @@ def test_a_jet_that_falls_is_drawn_out_and_keeps_together(viscosity):
     """Its width is that of continuity where it is 1.5 to 3 times as fast as at first."""
     width, gap, joined = falling_jet(7, 2, viscosity)
     assert abs(width - 1.0).max() < 0.05 and gap < 1.5 and joined == 1.0
-
-
-def test_pushed_alone_a_jet_falls_apart():
-    width, gap, joined = falling_jet(7, 2, solver=PCISPH)
-    assert width.max() > 2.0 and gap > 2.0 and joined < 0.6
 
 
 def test_a_film_flows_down_a_gentle_slope():
@@ -100,11 +93,7 @@ def test_water_at_rest_has_no_lasting_vortex():
     assert still_water(20, 5.0).speed < 0.1
 
 
-@pytest.mark.parametrize(
-    "given",
-    [{}, {"wavelength": 4.0}, {"wavelength": 4.0, "walls": True}],
-    ids=["deep water", "over a floor", "between walls"],
-)
+@pytest.mark.parametrize("given", [{}, {"wavelength": 4.0}, {"wavelength": 4.0, "walls": True}])
 def test_a_standing_wave_lasts_as_it_must(given):
     """Lamb (1932), in deep water, over a floor and between walls, whose particles would damp it twice as fast."""
     wave = standing_wave(24, **given)
@@ -161,12 +150,9 @@ def test_a_carreau_fluid_flows_between_plates_as_it_should():
     heights = np.linspace(0.0, 1.0, 201)
     slopes = [np.sign(0.5 - y) * shear_rate(DENSITY * PUSH * abs(0.5 - y)) for y in heights]
     exact = cumulative_trapezoid(slopes, heights, initial=0.0)
-
-    def speeds(y):
-        return np.interp(y, heights, exact)
-
-    y, u = channel(viscosity, {"kind": "carreau", "relaxation_time": time, "flow_index": index}, speeds, 0.005, 100)
-    assert u.mean() == pytest.approx(speeds(y).mean(), rel=0.005)
+    law = {"kind": "carreau", "relaxation_time": time, "flow_index": index}
+    y, u = channel(viscosity, law, lambda y: np.interp(y, heights, exact), 0.005, 100)
+    assert u.mean() == pytest.approx(np.interp(y, heights, exact).mean(), rel=0.005)
     assert DENSITY * PUSH / (12.0 * viscosity) < 0.3 * u.mean()
 
 
@@ -213,30 +199,12 @@ def test_the_pressure_in_a_drop_is_that_of_laplace(turned):
     assert abs(late.mean() - 1.0 - 0.5 / 12.0) < 0.02 and late.std() < 0.01
 
 
-def test_it_is_nearer_with_more_particles():
-    coarse, fine = (Drop(across, turned=45.0, discretisation=C4, periods=1.5) for across in (16, 36))
-    assert abs(fine.fit()[0] - 1.0) < 0.03 < abs(coarse.fit()[0] - 1.0)
-    late = [abs(made.pressure[len(made.time) // 2 :].mean() - 1.0) for made in (coarse, fine)]
-    assert late[1] < 0.6 * late[0]
-
-
 def test_without_tension_or_without_the_depth_of_the_curvature_it_does_not(monkeypatch):
     still = Drop(24, discretisation=C4, periods=0.5, surface_tension=0.0)
     assert still.stretch[-1] > 0.9 * still.stretch[0]
     made = CurvatureConstants.of
-
-    def shallow(*given):
-        found = made(*given)
-        return CurvatureConstants(found.spacing, found.width, 0.0)
-
-    monkeypatch.setattr(CurvatureConstants, "of", shallow)
+    monkeypatch.setattr(CurvatureConstants, "of", lambda *given: replace(made(*given), depth=0.0))
     assert Drop(24, turned=45.0, discretisation=C4, periods=1.5).fit()[0] > 1.06
-
-
-def test_how_far_the_drop_drifts():
-    """The force keeps momentum but nearly: of a drop whose particles are stirred."""
-    made = Drop(24, turned=20.0, jitter=0.1, discretisation=C4)
-    assert 1e-6 < made.drift.max() / made.speed.max() < 0.15
 
 
 def test_a_drop_in_space():

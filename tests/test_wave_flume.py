@@ -1,6 +1,5 @@
 """The numerical flume of `examples/wave_flume`: its theory, its fit, and a short run beside what was measured."""
 
-import re
 import runpy
 import sys
 from types import SimpleNamespace
@@ -32,18 +31,6 @@ def test_a_steady_flap_makes_the_waves_of_its_transfer_function(period, hinge):
     assert FLUME["period"](times, stroke) == pytest.approx(period, abs=0.005)
 
 
-def test_the_bar_of_a_gain_holds_what_a_model_lacks():
-    """Where an error lasts for many samples, the bar of noise is far too short, and that of blocks holds it."""
-    times, missed, random = np.arange(0.0, 9.0, 0.02), [], np.random.default_rng(1)
-    found = np.sin(2.0 * np.pi * times / 1.1)[:, None] * np.ones(4)
-    for _ in range(100):
-        slow = 0.1 * np.convolve(random.normal(size=len(times) + 49), np.hanning(50) / 5.0, mode="valid")
-        factor, noise, bar = FLUME["gain"](1.1 * found + slow[:, None], found, 55, draws=100)
-        missed.append([abs(factor - 1.1) > noise, abs(factor - 1.1) > bar])
-    of_noise, of_blocks = np.mean(missed, axis=0)
-    assert of_noise > 0.5 and of_blocks < 0.2
-
-
 def test_waves_come_to_the_probes_as_they_were_measured(monkeypatch, tmp_path, capsys):
     """With 12 particles in the depth; a flap that moved the other way would be 180 degrees off."""
     monkeypatch.chdir(tmp_path)
@@ -66,7 +53,6 @@ def own_case(monkeypatch, tmp_path):
     rows = [f"{one + 1.0},{0.001 + 0.01 * np.sin(6.0 * one)}" for one in times]
     (tmp_path / "flap.csv").write_text("\n".join(["time_s,wavemaker_m", *rows]))
     (tmp_path / "hull.csv").write_text("x_m,y_m\n-0.2,0.3\n-0.1,0\n0.1,0\n0.2,0.3\n")
-    (tmp_path / "crossed.csv").write_text("x_m,y_m\n0,0\n1,1\n1,0\n0,1\n")
 
 
 def test_a_flap_and_a_hull_of_ones_own_need_no_measurements(monkeypatch, own_case, capsys):
@@ -80,37 +66,8 @@ def test_a_flap_and_a_hull_of_ones_own_need_no_measurements(monkeypatch, own_cas
     said = capsys.readouterr().out
     assert "1 mm and 1 s" in said and "probes left out" in said and "3 m\n" in said
     assert "37.50 kg for each metre" in said and "correlation" not in said
-    assert [line.split()[0] for line in said.splitlines()[-6:-1]] == [
-        "0.50",
-        "1.60",
-        "sway_m:",
-        "heave_m:",
-        "roll_rad:",
-    ]
+    assert " ".join(line.split()[0] for line in said.splitlines()[-6:-1]) == "0.50 1.60 sway_m: heave_m: roll_rad:"
     assert "nan" not in said and np.ptp(read_picture("wave_flume.png")) > 0.5
-
-
-@pytest.mark.parametrize(
-    ("options", "wanted"),
-    [
-        (["hull.csv"], "has the columns x_m, y_m, but must have time_s"),
-        (["--hinge", "1"], "--hinge is 1 m, but must be from 0 to less than 1 m"),
-        (["gone.csv"], "gone.csv not found"),
-        (["flap.csv", *OWN, "--hull", "crossed.csv"], "no polygon"),
-        (["flap.csv", *OWN, "--draught", "0.3"], "would not float"),
-        (["flap.csv", *OWN, "--at", "7.9"], "not between the flap and 8 m"),
-        (["flap.csv", *OWN[:4]], "--at and --centre and --gyration are wanted"),
-        (["flap.csv", *OWN[2:]], "--hull HULL.csv"),
-        (["flap.csv", "--probes", "7"], "No probe is left"),
-        (["flap.csv", "--begin", "7"], "4 s or more"),
-    ],
-)
-def test_what_is_wrong_with_a_case_is_said_in_a_sentence(monkeypatch, own_case, capsys, options, wanted):
-    monkeypatch.setattr(sys, "argv", ["wave_flume.py", "--begin", "2", *options])
-    with pytest.raises(SystemExit) as end:
-        FLUME["arguments"]()
-    sentence = capsys.readouterr().err.splitlines()[-1]
-    assert end.value.code == 2 and re.search(re.escape(wanted), sentence) and sentence.endswith(".")
 
 
 def test_a_flap_makes_waves_meet_where_they_shall():

@@ -113,7 +113,6 @@ def test_a_gauge_above_a_round_or_slanted_solid_reads_the_level():
 
 
 def turned(dimension):
-    """Solids that move, of both kinds, in the water beside a gauge."""
     angle, flat = (0.2, 0.4) if dimension == 2 else ([0.2, 0.1, -0.3], [0.1, 0.4, 0.2])
     spin = 0.5 if dimension == 2 else [0.0, 0.0, 0.5]
     plate = {**box(dimension, [0.95, 0.1], [1.3, 0.24]), "rotation": angle, "motion": "path", "angular_velocity": spin}
@@ -122,7 +121,6 @@ def turned(dimension):
 
 
 def test_the_gradient_of_a_gauge_above_a_solid_that_moves():
-    """Through a run, to how the solid begins and to the fluid."""
     solid = [{"name": "sill", "shape": "box", "lower": [0.1, 0.02], "upper": [0.3, 0.1], "motion": "path"}]
     simulation = cortado.Simulation(plane(solid=[{**solid[0], "velocity": [0.2, 0.1]}]), precision="float64")
     dt, random = simulation.scene.solver.time_step, np.random.default_rng(3)
