@@ -13,13 +13,14 @@ from scenes import box, jet, plane, pool, scene
 
 SPACING = 0.025
 HOLE = {"shape": "sink", "name": "hole"}
+OVER = {"shape": "box", "name": "over", "lower": [0.3, 0.36]}
 SOLVER = {"kind": "projection", "time_step": 0.002}
 
 
 def emptied(d, made=None, **keys):
     """A block of fluid beside a wall, or another scene, with a sink off the floor and a box above."""
     sink = {**HOLE, "position": [0.22, 0.02, 0.13][:d], "radius": 0.05, "flow_rate": [0.05, 0.01][d - 2]}
-    over = {"shape": "box", "name": "over", "lower": [0.3, 0.36, 0.0][:d]}
+    over = {**OVER, "lower": [*OVER["lower"], 0.0][:d]}
     return (made or (plane if d == 2 else scene))(drain=[sink, over], solver=SOLVER, **keys)
 
 
