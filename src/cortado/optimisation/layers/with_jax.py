@@ -288,25 +288,68 @@ def _jax_array(found: Array, wanted: Any) -> Any:
 
 
 class ForeignFunction:
-    """A Python function of arrays for compiled programs."""
+    """A Python function of arrays for compiled programs. Arrays of one data type are passed in one buffer, because a
+    call costs more for each buffer than for its numbers."""
 
     def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
-        self._number = next(_NUMBERS)
-        _FUNCTIONS[self._number] = function
+        self._function, self._number = function, next(_NUMBERS)
         finalize(self, _let_go, self._number)
 
     @WARP
     def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        given = [array.reshape(array.shape or (1,)) for array in arrays]
-        dims = {f"out_{k}": shape or (1,) for k, shape in enumerate(shapes)}
-        kinds = tuple((array.ndim, str(array.dtype)) for array in given)
-        made = tuple((len(shape), str(own.dtype)) for shape, own in zip(dims.values(), results, strict=True))
-        found = _callable(kinds, made)(*given, self._number, output_dims=dims)
-        return [own.reshape(result.shape) for own, result in zip(found, results, strict=True)]
+        given, made = Packing([(a.shape, a.dtype) for a in arrays]), Packing([(r.shape, r.dtype) for r in results])
+        own = Packing(list(zip(shapes, (result.dtype for result in results), strict=True)))
+        _FUNCTIONS[self._number] = partial(_call, self._function, given, own)
+        packed = [jnp.concatenate([arrays[k].reshape(-1) for k in group]) for group in given.groups.values()]
+        dims = {f"out_{k}": size for k, size in enumerate(made.sizes)}
+        found = _callable(tuple(given.groups), tuple(made.groups))(*packed, self._number, output_dims=dims)
+        return made.unpacked(found)
+
+
+class Packing:
+    """The places of arrays with known shapes and data types in one flat array for each data type."""
+
+    def __init__(self, kinds: Sequence[tuple[Sizes, Any]]):
+        self._shapes = [shape for shape, _ in kinds]
+        self.groups: dict[str, list[int]] = {}
+        """Numbers of the arrays of each data type."""
+        for k, (_, dtype) in enumerate(kinds):
+            self.groups.setdefault(str(dtype), []).append(k)
+        self.ends = {d: np.cumsum([0, *(prod(self._shapes[k]) for k in own)]).tolist() for d, own in self.groups.items()}
+
+    @property
+    def sizes(self) -> list[int]:
+        return [ends[-1] for ends in self.ends.values()]
+
+    def unpacked(self, whole: Sequence[Any]) -> list[Any]:
+        """Return views of flat arrays in the shapes of the packed arrays."""
+        found: list[Any] = [None] * len(self._shapes)
+        for flat, (dtype, group) in zip(whole, self.groups.items(), strict=True):
+            for k, first, end in zip(group, self.ends[dtype], self.ends[dtype][1:], strict=False):
+                shape = self._shapes[k]
+                found[k] = flat[first:end].reshape((shape or (1,)) if isinstance(flat, wp.array) else shape)
+        return found
+
+
+def _call(
+    function: Callable[[list[Array]], Sequence[Array]], given: Packing, made: Packing, whole: Arrays, results: Arrays
+) -> None:
+    """Apply a function to flat Warp arrays, and write its results to flat Warp arrays."""
+    found = function(given.unpacked([flat.numpy() if flat.device.is_cpu else flat for flat in whole]))
+    for result, (dtype, group) in zip(results, made.groups.items(), strict=True):
+        flat = result.numpy() if result.device.is_cpu else None
+        for k, first, end in zip(group, made.ends[dtype], made.ends[dtype][1:], strict=False):
+            own = found[k]
+            if flat is not None:
+                flat[first:end] = on_host(own).reshape(-1)
+            elif isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
+                wp.copy(result[first:end], own.flatten())
+            else:
+                result[first:end].assign(on_host(own).reshape(-1))
 
 
 _NUMBERS = count(1)
-_FUNCTIONS: dict[int, Callable[[list[Array]], Sequence[Array]]] = {}
+_FUNCTIONS: dict[int, Callable[[Arrays, Arrays], None]] = {}
 _GONE: deque[int] = deque()
 
 
@@ -317,24 +360,19 @@ def _let_go(number: int) -> None:
 
 
 @cache
-def _callable(given: tuple[tuple[int, str], ...], made: tuple[tuple[int, str], ...]) -> Any:
+def _callable(given: Names, made: Names) -> Any:
+    """Make a JAX function that calls one of `_FUNCTIONS` with flat arrays of the given data types."""
+
     def call(*arguments: Any) -> None:
         arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
         with WARP, _in_order(results[0].device):
             try:
-                found = _FUNCTIONS[number]([array.numpy() if array.device.is_cpu else array for array in arrays])
+                _FUNCTIONS[number](arrays, results)
             except CortadoError as error:
                 raise error.with_traceback(None) from None
-            for result, own in zip(results, found, strict=True):
-                if isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
-                    wp.copy(result, own.reshape(result.shape))
-                elif result.device.is_cpu:
-                    np.copyto(result.numpy(), on_host(own).reshape(result.shape))
-                else:
-                    result.assign(on_host(own).reshape(result.shape))
 
-    types = {f"in_{k}": _annotation(*kind) for k, kind in enumerate(given)}
-    types |= {"number": int} | {f"out_{k}": _annotation(*kind) for k, kind in enumerate(made)}
+    types = {f"in_{k}": wp.array(dtype=getattr(wp, dtype)) for k, dtype in enumerate(given)}
+    types |= {"number": int} | {f"out_{k}": wp.array(dtype=getattr(wp, dtype)) for k, dtype in enumerate(made)}
     call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in types]
     )
@@ -358,7 +396,3 @@ def _in_order(device: Any) -> AbstractContextManager[Any]:
 @cache
 def _stream(device: str) -> Any:
     return wp.Stream(device)
-
-
-def _annotation(axes: int, dtype: str) -> Any:
-    return wp.array(dtype=getattr(wp, dtype), ndim=axes)
