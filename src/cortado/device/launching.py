@@ -6,7 +6,7 @@ name. In a bundle called ``dot`` or ``bar``, the field ``x`` is the array ``x_do
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -314,16 +314,26 @@ class BandLauncher:
 
 class HostCopy:
     def __init__(self, array: wp.array):
-        self._array = array
-        self._copy: Any = array if array.device.is_cpu else None
+        self._array, self._is_cpu = array, array.device.is_cpu
+        self.is_fetched = False
+        """True while the copy of the last `fetch` is complete and up to date, so that `read` does not copy."""
+
+    @cached_property
+    def _copy(self) -> wp.array:
+        return self._array if self._is_cpu else wp.empty_like(self._array, device="cpu", pinned=True)
+
+    @cached_property
+    def _view(self) -> np.ndarray:
+        return self._copy.numpy()
+
+    def fetch(self) -> None:
+        """Begin to copy from the device. The copy can be part of a captured graph."""
+        if not self._is_cpu:
+            wp.copy(self._copy, self._array)
 
     def read(self, rows: int | None = None) -> np.ndarray:
         """Wait for the device, and return the array or its first ``rows`` rows. The next call overwrites the result."""
-        if rows == 0:
-            return wp.empty((0, *self._array.shape[1:]), dtype=self._array.dtype, device="cpu").numpy()
-        if self._copy is None:
-            self._copy = wp.empty_like(self._array, device="cpu", pinned=True)
-        if self._copy is not self._array:
-            wp.copy(self._copy, self._array)
+        if not (self._is_cpu or self.is_fetched or rows == 0):
+            self.fetch()
             wp.synchronize_stream(self._array.device)
-        return self._copy.numpy()[:rows]
+        return self._view[:rows]

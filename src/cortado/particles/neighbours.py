@@ -334,7 +334,7 @@ class NeighbourSearch:
         self.fluid_count, self.filling, self.count, self.all_count = self.lists.values()
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
-        self._seen = HostCopy(self._needed)
+        self.needed_copy = HostCopy(self._needed)
         still, moving = walls.some(walls.solid < 0), walls.some(walls.solid >= 0)
         count = len(still) + layout.members * len(moving)
         kinds = {"positions": precision.vector, "feet": precision.vector, "velocities": precision.vector}
@@ -397,7 +397,7 @@ class NeighbourSearch:
     @property
     def needed(self) -> int:
         """Return the length of the longest list since the last `forget_needed`, even if it exceeded the capacity."""
-        return int(self._seen.read().max())
+        return int(self.needed_copy.read().max())
 
     def forget_needed(self) -> None:
         self._needed.zero_()

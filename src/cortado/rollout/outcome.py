@@ -16,6 +16,8 @@ TORN = 0.015
 
 
 def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
+    if rollout.is_calm({"divergence": TORN, Solve.name: Solve.most - 1}) and not scene.solver.chooses:
+        return
     noted = rollout.diagnostics
     converged = noted["converged"]
     if not converged.all():

@@ -5,7 +5,7 @@ lists were too short. On a GPU, a chunk of forward steps is a captured graph, an
 mode. Graphs are also used on a CPU if launches use one thread.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import count
 from typing import Protocol
@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from cortado.calls import Staying
-from cortado.device.launching import CapturedGraph
+from cortado.device.launching import CapturedGraph, HostCopy
 from cortado.device.modules import compile_ahead
 from cortado.device.reduction import add
 from cortado.device.threads import WARP, Turn, in_turn, require, step_parts, within
@@ -127,6 +127,7 @@ class Rollout(Staying):
         self.copies: list[State] = []
         self.beside: dict[tuple[str, ...], Beside] = {}
         self.longest_chunk = length
+        self._copies = [*solver.copies, *(self.log.copies if steps <= length else ())]
         self.goes_on = False
         self.evaluation = 0
         """Number of the current evaluation. It increases with every new first state and with new parameters."""
@@ -140,6 +141,10 @@ class Rollout(Staying):
         """Diagnostics of the last forward run by name, (steps,), or (steps, batch) for a batch. See `StepLog`."""
         found = self.log.diagnostics
         return self.progress.whole({**found, **self.step_sizes.diagnostics(len(found["converged"]))})
+
+    def is_calm(self, limits: Mapping[str, float]) -> bool:
+        """Test if no scene was lost and all steps converged, without diagnostics above the given ``limits`` by name."""
+        return not self.lost and self.progress.state is None and self.log.is_calm(limits)
 
     def is_last(self, step: int) -> bool:
         return step == self.steps or self.step_sizes.is_end(step)
@@ -182,7 +187,8 @@ class Rollout(Staying):
         self._forget_stale_graphs()
         if self.steps > 0:
             compile_ahead(self.solver, self._device)
-        self.solver.reset(step)
+        if step > 0:
+            self.solver.reset(step)
         try:
             while step < self.steps and not ended:
                 last = step + self._length(self.steps - step)
@@ -194,10 +200,13 @@ class Rollout(Staying):
                 chunk = self._advance(step, last, reader)
                 if meanwhile is not None:
                     meanwhile()
+                self._wait()
                 while self.solver.make_room() or self.step_sizes.again(step, last):
                     self._forget_stale_graphs()
-                    self.solver.reset(step)
+                    if step > 0:
+                        self.solver.reset(step)
                     chunk = self._advance(step, last, reader)
+                    self._wait()
                 end, ended = self.step_sizes.read(step, last)
                 chunk = chunk[: end - step]
                 lost = {b: one for b, one in self.solver.containment.lost().items() if one.step < end}
@@ -219,6 +228,7 @@ class Rollout(Staying):
         finally:
             self.taken = step
             self.log.read(step)
+            self._mark(self.solver.copies, is_fetched=False)
         self._run = self.evaluation
         if keep:
             self._kept = self.evaluation
@@ -228,7 +238,12 @@ class Rollout(Staying):
         length, beside = last - first, None if reader is None else reader.beside
         if self._device.is_cuda and beside not in self._warm:
             self._warm_up(first, beside)
-        self._begin_at(first)
+        if first > 0:
+            self._begin_at(first)
+        else:
+            self._reset()
+            self.step_sizes.seek(0)
+        self._mark(self._copies, is_fetched=False)
         key = length, beside, self._input is self._buffer
         if is_new := key not in self._chunks:
             work = partial(self._take, length, beside)
@@ -238,6 +253,16 @@ class Rollout(Staying):
             name = type(self.solver).__name__
             raise InputError(f"solver {name} does not count its steps: its method step must end with self.end_step.")
         return self._chunk[:length]
+
+    def _wait(self) -> None:
+        """Wait for the device. The copies that a chunk fetched are then up to date."""
+        if self._device.is_cuda:
+            wp.synchronize_stream(self._device)
+            self._mark(self._copies, is_fetched=True)
+
+    def _mark(self, copies: Iterable[HostCopy], is_fetched: bool) -> None:
+        for copy in copies:
+            copy.is_fetched = is_fetched
 
     def _length(self, left: int) -> int:
         """Return the number of steps of the next chunk."""
@@ -263,12 +288,15 @@ class Rollout(Staying):
                 beside.launch(number, self.parameters)
             self.step_sizes.choose(new_state)
             state = new_state
+        for copy in self._copies:
+            copy.fetch()
 
     def _forget_stale_graphs(self) -> None:
         if self._generation == self.solver.generation:
             return
         self._generation, self._warm = self.solver.generation, set[Beside | None]()
         self._chunks: dict[tuple[int, Beside | None, bool], CapturedGraph] = {}
+        self._reset = CapturedGraph(self.solver.reset, self.solver.launch)
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 

@@ -209,7 +209,7 @@ class Containment:
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
         """First lost particle of each scene, or `NO_PARTICLE` (members,)."""
         self._count = wp.zeros(members, dtype=wp.int32, device=device)
-        self._seen = HostCopy(self.bad_step)
+        self.bad_step_copy = HostCopy(self.bad_step)
 
     def reset(self, step: int = 0) -> None:
         """Forget particles that were lost in step ``step`` or later."""
@@ -233,7 +233,7 @@ class Containment:
 
     def lost(self) -> dict[int, Lost]:
         """Return the lost particles since `reset`, by scene number."""
-        steps = self._seen.read()
+        steps = self.bad_step_copy.read()
         members = np.flatnonzero(steps >= 0).tolist()
         if not members:
             return {}

@@ -1,6 +1,7 @@
 """Iterations within a time step that end when the errors are small enough. Kernels decide when to stop."""
 
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
@@ -130,26 +131,43 @@ class LoopLimits:
     """Upper bound on the error of every particle; may be infinite."""
 
 
-class StepRecord:
+class StepRecord(ABC):
     """Arrays (steps, members) on the device with numbers of a loop or a solve for each step."""
 
     def __init__(self, steps: int, layout: Layout, *kinds: Any):
         """Allocate an array of iterations, and arrays of the Warp types ``kinds``."""
         shape = (max(steps, 1), layout.members)
         self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in (wp.int32, *kinds)]
-        self._seen, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
-        self.diagnostics: dict[str, NDArray] = {}
-        """Diagnostics by name (steps,), in a batch (steps, batch)."""
+        self.copies, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
+        self.read(0)
 
-    def values(self, steps: int) -> list[NDArray]:
-        """Return the first ``steps`` steps of each array, (steps, ...) or in a batch (steps, batch, ...)."""
-        found = [copy.read(steps) for copy in self._seen]
-        return [array[:, 0] if self._batch is None else array for array in found]
+    def read(self, steps: int) -> None:
+        """Take the first ``steps`` steps as the steps of the last run. They are read when they are asked for."""
+        self.steps, self._diagnostics = steps, None
+
+    @property
+    def diagnostics(self) -> dict[str, NDArray]:
+        """Return the diagnostics by name (steps,), in a batch (steps, batch)."""
+        if self._diagnostics is None:
+            found = [copy.read(self.steps) for copy in self.copies]
+            self._diagnostics = self._named(*(array[:, 0] if self._batch is None else array for array in found))
+        return self._diagnostics
+
+    _diagnostics: dict[str, NDArray] | None
+
+    @abstractmethod
+    def _named(self, iterations: NDArray, *others: NDArray) -> dict[str, NDArray]:
+        """Return diagnostics by name from the numbers of the last run."""
+
+    @abstractmethod
+    def is_calm(self, limits: Mapping[str, float]) -> bool:
+        """Test if all steps have converged, without columns above the given limits."""
 
     def assign(self, other: Self) -> None:
-        for own, given in zip(self.arrays, other.arrays, strict=True):
+        for own, given, copy in zip(self.arrays, other.arrays, self.copies, strict=True):
             wp.copy(own, given)
-        self.diagnostics = other.diagnostics
+            copy.is_fetched = False
+        self.read(other.steps)
 
 
 class SolveRecord(StepRecord):
@@ -158,10 +176,12 @@ class SolveRecord(StepRecord):
     def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
         super().__init__(steps, layout)
         self.solve, self._note = solve, convergence_kernels(layout.precision).note
-        self.read(0)
 
-    def read(self, steps: int) -> None:
-        self.diagnostics = {self.solve.name: self.values(steps)[0].astype(int)}
+    def _named(self, iterations: NDArray, *others: NDArray) -> dict[str, NDArray]:
+        return {self.solve.name: iterations.astype(int)}
+
+    def is_calm(self, limits: Mapping[str, float]) -> bool:
+        return not (self.copies[0].read(self.steps) > limits.get(self.solve.name, np.inf)).any()
 
     def note(self, launch: KernelLauncher, step: wp.array) -> None:
         """Record the number of iterations of a solve. ``step`` is the number of the step in each scene."""
@@ -173,66 +193,82 @@ class LoopRecord(StepRecord):
     """Numbers of iterations and errors of a loop in each step."""
 
     def __init__(self, steps: int, loop: "Loop"):
-        super().__init__(steps, loop.layout, loop.layout.precision.pair)
         self.loop = loop
-        self.read(0)
+        super().__init__(steps, loop.layout, loop.layout.precision.pair)
 
-    def read(self, steps: int) -> None:
-        iterations, errors = self.values(steps)
-        self.diagnostics = {self.loop.iterations_name: iterations.astype(int)}
-        self._count()
-        for number, name in enumerate(self.loop.columns):
-            self.diagnostics[name] = errors[..., number].astype(np.float64)
+    def _named(self, iterations: NDArray, *others: NDArray) -> dict[str, NDArray]:
+        (errors,) = others
+        found = {name: errors[..., number].astype(np.float64) for number, name in enumerate(self.loop.columns)}
+        return {self.loop.iterations_name: iterations.astype(int), **found}
 
-    def assign(self, other: Self) -> None:
-        super().assign(other)
-        self._count()
+    @property
+    def counts(self) -> NDArray:
+        """Return the number of iterations of each step (steps,). In a batch it is the greatest number of all scenes."""
+        return self.copies[0].read(self.steps).max(axis=1)
 
-    def _count(self) -> None:
-        found = self.diagnostics[self.loop.iterations_name]
-        self.counts = found if found.ndim == 1 else found.max(axis=1)
-        """Number of iterations of each step (steps,). In a batch it is the greatest number of all scenes."""
+    @property
+    def _bounds(self) -> tuple[float, ...]:
+        limits = self.loop.limits
+        if limits is None or limits.minimum_iterations == limits.maximum_iterations:
+            return ()
+        return limits.tolerance, limits.greatest_tolerance
 
     @property
     def converged(self) -> NDArray:
         """Test for each step if the errors are within the tolerances, (steps,) or (steps, batch)."""
-        limits, found = self.loop.limits, [self.diagnostics[name] for name in self.loop.columns]
-        if limits is None or limits.minimum_iterations == limits.maximum_iterations:
-            return np.ones(found[0].shape, dtype=bool)
-        bounds = limits.tolerance, limits.greatest_tolerance
-        return np.logical_and.reduce([column <= bound for column, bound in zip(found, bounds, strict=False)])
+        found = [self.diagnostics[name] for name in self.loop.columns]
+        columns = [column <= bound for column, bound in zip(found, self._bounds, strict=False)]
+        return np.logical_and.reduce([np.ones(found[0].shape, dtype=bool), *columns])
+
+    def is_calm(self, limits: Mapping[str, float]) -> bool:
+        errors = self.copies[1].read(self.steps)
+        if not self.steps:
+            return True
+        bounds = (*self._bounds, *[np.inf] * len(self.loop.columns))
+        greatest = errors.max(axis=(0, 1)).tolist()
+        columns = zip(self.loop.columns, greatest, bounds, strict=False)
+        return all(error <= min(bound, limits.get(name, np.inf)) for name, error, bound in columns)
 
 
 class IterationLog:
     """A `StepLog` of loops and of the solves of forces."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
-        self.records = tuple(LoopRecord(steps, loop) for loop in loops)
+        self.loops = tuple(LoopRecord(steps, loop) for loop in loops)
         self.solves = tuple(SolveRecord(steps, solve, layout) for solve in solves)
+        self.records: tuple[StepRecord, ...] = (*self.loops, *self.solves)
         self._steps, self._layout = 0, layout
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
         scenes = () if self._layout.batch is None else (self._layout.batch,)
         found, converged = dict[str, NDArray](), np.ones((self._steps, *scenes), dtype=bool)
-        for record in (*self.records, *self.solves):
+        for record in self.records:
             found |= record.diagnostics
-        for loop in self.records:
+        for loop in self.loops:
             converged &= loop.converged
         return {**found, "converged": converged}
 
+    def is_calm(self, limits: Mapping[str, float]) -> bool:
+        """Test if all loops have converged in all steps, without diagnostics above the given ``limits`` by name."""
+        return all(record.is_calm(limits) for record in self.records)
+
+    @property
+    def copies(self) -> list[HostCopy]:
+        return [copy for record in self.records for copy in record.copies]
+
     def read(self, steps: int) -> None:
         self._steps = steps
-        for record in (*self.records, *self.solves):
+        for record in self.records:
             record.read(steps)
 
     def assign(self, other: "IterationLog") -> None:
         self._steps = other._steps
-        for own, given in zip((*self.records, *self.solves), (*other.records, *other.solves), strict=True):
+        for own, given in zip(self.records, other.records, strict=True):
             own.assign(given)
 
     def seek(self, step: int) -> Counts:
-        return tuple(record.loop.seek(record, step) for record in self.records)
+        return tuple(record.loop.seek(record, step) for record in self.loops)
 
 
 class Loop:

@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.calls import Staying
-from cortado.device.launching import KernelLauncher
+from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.threads import Turn, gradient_parts
 from cortado.discretise.shapes import Points
 from cortado.discretise.smoothing import SKIN
@@ -157,6 +157,10 @@ class ParticleSolver(Staying):
             self.substeps = substeps
             self.generation += 1
 
+    @property
+    def copies(self) -> tuple[HostCopy, ...]:
+        return self.search.needed_copy, self.containment.bad_step_copy
+
     def make_room(self) -> bool:
         needed, capacity = self.search.needed, self.search.capacity
         if needed <= capacity:
@@ -239,7 +243,7 @@ class ParticleSolver(Staying):
         containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
         for solve in log.solves:
             solve.note(self.launch, self.step_number)
-        for k, (loop, record) in enumerate(zip(self.loops, log.records, strict=True), 1):
+        for k, (loop, record) in enumerate(zip(self.loops, log.loops, strict=True), 1):
             loop.note(record, containment, self.step_number, is_last=k == len(self.loops))
         if not self.loops:
             count_step = convergence_kernels(self.discretisation.precision).count_step
@@ -287,7 +291,7 @@ class ParticleSolver(Staying):
         raise MissingDerivativeError(f"{self.system.called} has no {what}: {advice}, or another solver.")
 
     def gradient_memory(self, log: IterationLog) -> dict[str, float]:
-        iterations = sum(int(record.counts.max(initial=0)) for record in log.records)
+        iterations = sum(int(record.counts.max(initial=0)) for record in log.loops)
         return gradient_parts(self.layout.all_particles, iterations, self.discretisation.precision.bytes)
 
 

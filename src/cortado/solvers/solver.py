@@ -10,7 +10,7 @@ from typing import Any, Protocol, Self
 import warp as wp
 from numpy.typing import NDArray
 
-from cortado.device.launching import KernelLauncher
+from cortado.device.launching import HostCopy, KernelLauncher
 from cortado.device.threads import Turn
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Fields, Layout, Parameters, State
@@ -34,8 +34,15 @@ class StepLog(Protocol):
         numbers of iterations.
         """
 
+    @property
+    def copies(self) -> Sequence[HostCopy]:
+        """Return the copies on the host of the log's arrays."""
+
+    def is_calm(self, limits: Mapping[str, float]) -> bool:
+        """Test if all loops converged in all steps up to the last `read`, without diagnostics above ``limits``."""
+
     def read(self, steps: int) -> None:
-        """Read the diagnostics of the first ``steps`` steps from the device."""
+        """Take the first ``steps`` steps as the last run. Their diagnostics are read from the device when needed."""
 
     def assign(self, other: Self) -> None:
         """Copy the diagnostics from a log of the same solver and length."""
@@ -131,6 +138,10 @@ class Solver(Protocol):
 
     def reset(self, step: int = 0) -> None:
         """Prepare to take step ``step``, and forget all records of this step and later steps."""
+
+    @property
+    def copies(self) -> Sequence[HostCopy]:
+        """Return the copies on the host of the arrays that `make_room` and the search for lost particles read."""
 
     def make_room(self) -> bool:
         """Lengthen neighbour lists that were too short. Return True if steps must be repeated because of short
