@@ -284,6 +284,7 @@ class Parameters(Arrays):
     def __init__(self, arrays: Mapping[str, wp.array]):
         super().__init__(arrays)
         self._written: dict[str, np.ndarray | wp.array] = {}
+        self._tables: dict[str, np.ndarray] = {}
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
@@ -311,12 +312,18 @@ class Parameters(Arrays):
             if array.ndim == 2 and axis >= 0 and 1 < given.shape[axis] < array.shape[1]:
                 room = array.shape[1] - given.shape[axis]
                 given = np.pad(given, [(0, room if k == axis else 0) for k in range(given.ndim)], mode="edge")
-            if is_vector:
-                table = np.zeros((*array.shape, 3))
-                table[..., : given.shape[-1]] = given
+            table = self._on_host(name)
+            (table[..., : given.shape[-1]] if is_vector else table)[...] = given
+            if not array.device.is_cpu:
                 array.assign(table)
-            else:
-                array.assign(np.broadcast_to(given, array.shape))
+
+    def _on_host(self, name: str) -> np.ndarray:
+        """Return an array for the numbers of a parameter, which on a CPU has its memory. Third components are 0."""
+        if name not in self._tables:
+            array = self[name]
+            shape = (*array.shape, *getattr(array.dtype, "_shape_", ()))
+            self._tables[name] = array.numpy() if array.device.is_cpu else np.zeros(shape)
+        return self._tables[name]
 
     def set_row(self, row: int, values: Mapping[str, np.ndarray]) -> None:
         """Write the values of parameters over time for one time step, as vectors (members, d) or numbers (members,).

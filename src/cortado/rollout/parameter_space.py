@@ -52,8 +52,9 @@ class ParameterSpace:
         self._first_positions = FirstPositions(simulation)
         self._told: set[str] = set()
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
-        self._judged: Arrays | None = None
-        self._strongest: tuple[Arrays, float] | None = None
+        self._judged: tuple[Arrays, float] | None = None
+        """The last judged values, and the square of the strongest gravity among those that differ in nothing else."""
+        self._have_checks = any(hasattr(maker, "check") for maker in simulation.forces)
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Return values as float64 arrays. Raises `InputError` for invalid values. With ``what`` "direction", negative
@@ -64,18 +65,25 @@ class ParameterSpace:
             if view in values and name in values:
                 raise InputError(f"{what} {name} is given, but must be left out, as {view} is given in its place.")
         found = {name: self._checked(name, value, what) for name, value in values.items()}
-        last = self._judged
-        is_judged = (
-            last is not None
-            and last.keys() == found.keys()
-            and all(np.array_equal(value, last[name]) for name, value in found.items())
-        )
-        if what != "direction" and not is_judged:
-            check_sizes(found, self._simulation.precision, self._known)
-            for number, own in enumerate(self._different(found)):
-                self._check(own, number)
-            self._judged = {name: value.copy() for name, value in found.items()}
+        if what != "direction":
+            self._judge(found)
         return found
+
+    def _judge(self, values: Arrays) -> None:
+        """Raise `InputError` for values that a run cannot take, and warn, unless the last judged values were the same."""
+        last, strongest = self._judged or ({}, 0.0)
+        is_first = self._judged is None or last.keys() != values.keys()
+        changed = [name for name, value in values.items() if is_first or not np.array_equal(value, last[name])]
+        if not (changed or is_first):
+            return
+        is_of_gravity = not is_first and changed == ["gravity"] and not self._have_checks
+        gravity = float(np.square(values["gravity"]).sum(axis=-1).max()) if "gravity" in values else 0.0
+        if not is_of_gravity or gravity > strongest:
+            check_sizes({name: values[name] for name in changed}, self._simulation.precision, self._known)
+            for number, own in enumerate(self._different(values)):
+                self._check(own, number)
+        copies = {name: values[name].copy() if name in changed else last[name] for name in values}
+        self._judged = copies, max(gravity, strongest) if is_of_gravity else gravity
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
         found = require_names(what, names)
@@ -195,8 +203,10 @@ class ParameterSpace:
         rollout.clocks = [state.clock for state in states]
         write(rollout.initial)
         if "gravity" in members[0]:
-            rows = max(self._steps, 1), self._simulation.dimension
-            rollout.parameters.set({"gravity": np.stack([np.broadcast_to(m["gravity"], rows) for m in members])})
+            rows = np.empty((len(members), max(self._steps, 1), self._simulation.dimension))
+            for own, member in zip(rows, members, strict=True):
+                own[:] = member["gravity"]
+            rollout.parameters.set({"gravity": rows})
 
     @cached_property
     def _is_still(self) -> bool:
@@ -338,20 +348,9 @@ class ParameterSpace:
             place = "" if self._batch is None else f"In scene {number} of the batch, "
             raise OutOfRangeError(f"{place}{error}") from error
         upright = self._one.upright(values)
-        unstable = unstable_sentence(upright, simulation.scene, self._told) if self._is_stronger(upright) else None
+        unstable = unstable_sentence(upright, simulation.scene, self._told)
         for sentence in filter(None, (crowded, unstable)):
             warn(sentence)
-
-    def _is_stronger(self, values: Arrays) -> bool:
-        others = {name: np.zeros(0) if name == "gravity" else value.copy() for name, value in values.items()}
-        strength = float(np.linalg.norm(np.atleast_2d(values["gravity"]), axis=1).max()) if "gravity" in values else 0.0
-        last, self._strongest = self._strongest, (others, strength)
-        if last is None or last[0].keys() != others.keys():
-            return bool(values)
-        if not all(np.array_equal(value, others[name]) for name, value in last[0].items()):
-            return True
-        self._strongest = others, max(strength, last[1])
-        return strength > last[1]
 
     def _together(self, fields: list[Arrays]) -> Arrays:
         return fields[0] if self._batch is None else stacked(fields * (self._batch // len(fields)))

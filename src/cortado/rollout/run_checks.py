@@ -101,8 +101,9 @@ class FirstPositions:
     def check(self, values: Arrays, member: int) -> str | None:
         """Return a warning if first positions are too close together, or None. Raises `InputError` if two particles
         coincide or would fly apart."""
-        simulation = self._simulation
-        positions = values.get("initial_positions", simulation.positions)
+        if "initial_positions" not in values:
+            return None
+        simulation, positions = self._simulation, values["initial_positions"]
         spacing = simulation.scene.discretisation.spacing
         former = self._judged.get(member, simulation.positions)
         if np.abs(positions - former).max(initial=0.0) < 0.05 * spacing:

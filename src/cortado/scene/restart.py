@@ -23,13 +23,13 @@ class Clock:
     time_step: float = field(default=0.0, repr=False)
     """Length of the last adaptive time step [s]; 0 for fixed time steps."""
 
-    def times(self, steps: NDArray, time_step: float) -> NDArray:
+    def times(self, steps: NDArray | int, time_step: float) -> Any:
         """Return the times (frames,) [s] after ``steps`` (frames,) further steps of length ``time_step`` [s]."""
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
     def after(self, steps: int, time_step: float) -> "Clock":
         """Return the clock after ``steps`` further steps."""
-        return Clock(self.steps + steps, float(self.times(np.array(steps), time_step)))
+        return Clock(self.steps + steps, float(self.times(steps, time_step)))
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RecordedClock(Clock):
     sizes: NDArray = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
     """Length of each step (steps,) [s]."""
 
-    def times(self, steps: NDArray, time_step: float) -> NDArray:
+    def times(self, steps: NDArray | int, time_step: float) -> Any:
         """Return the times (frames,) [s] after ``steps`` further steps; ``time_step`` is ignored."""
         return np.interp(steps, np.arange(len(self.recorded)), self.recorded)
 

@@ -221,13 +221,10 @@ class LoopRecord(StepRecord):
         return np.logical_and.reduce([np.ones(found[0].shape, dtype=bool), *columns])
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
+        wanted = [limits.get(name, np.inf) for name in self.loop.columns]
+        bounds = [min(pair) for pair in zip(wanted, (*self._bounds, np.inf, np.inf), strict=False)]
         errors = self.copies[1].read(self.steps)
-        if not self.steps:
-            return True
-        bounds = (*self._bounds, *[np.inf] * len(self.loop.columns))
-        greatest = errors.max(axis=(0, 1)).tolist()
-        columns = zip(self.loop.columns, greatest, bounds, strict=False)
-        return all(error <= min(bound, limits.get(name, np.inf)) for name, error, bound in columns)
+        return all(bool((errors[..., k] <= bound).all()) for k, bound in enumerate(bounds) if bound < np.inf)
 
 
 class IterationLog:

@@ -221,6 +221,8 @@ class NamedStates(HostStates):
         super().__init__(simulation)
         self._simulation: Simulation = simulation
         self._space, self._is_cpu = ParameterSpace(simulation, 0), bool(simulation.device.is_cpu)
+        self._last: tuple[Named, tuple[RestartState, ...]] | None = None
+        """On a CPU, the last returned state, and its clocks and origins."""
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
         """Origins of the particles of valid states, by the checksum of the state."""
 
@@ -244,14 +246,14 @@ class NamedStates(HostStates):
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
         """Copy the state of a rollout after ``steps`` steps to named arrays. Lost scenes get NaN."""
-        fields = self.read(state, dict.fromkeys(rollout.lost, np.nan))
-        clocks = [scene.clock for scene in scenes_after(rollout, steps)]
-        return self._with_clocks(fields, clocks, rollout.origins)
+        return self._returned(self.read(state, dict.fromkeys(rollout.lost, np.nan)), scenes_after(rollout, steps))
 
     def arrays(self, state: DeviceState) -> Named:
         """Copy a state on the device to named arrays."""
-        origins = [one.origin for one in state.scenes if one.origin and one in self._simulation.judged_states]
-        return self._with_clocks(self.read(state.arrays, {}), [one.clock for one in state.scenes], origins)
+        found = self._returned(self.read(state.arrays, {}), state.scenes)
+        if not all(scene in self._simulation.judged_states for scene in state.scenes):
+            self._last = None
+        return found
 
     def restart_states(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return the restart states of all scenes, given the parameter ``values`` of the next steps. Raises
@@ -288,17 +290,42 @@ class NamedStates(HostStates):
             else:
                 own.assign(on_host(array).reshape(own.shape))
 
-    def _with_clocks(self, fields: dict[str, Array], clocks: list[Clock], origins: list[Origin]) -> Named:
-        if self._is_cpu and len(origins) == len(clocks):
-            self._remember(self._checksum(fields), tuple(origins))
+    def _returned(self, fields: dict[str, Array], scenes: Sequence[RestartState]) -> Named:
+        """Add the clocks of all scenes to the fields of a state. On a CPU, remember the state as valid."""
         members, found = self.shapes[STATE_TIME], dict(fields)
-        found[STATE_TIME] = np.reshape([clock.time for clock in clocks], members)
+        found[STATE_TIME] = np.reshape([scene.clock.time for scene in scenes], members)
         if LAST_STEP in self.shapes:
-            found[LAST_STEP] = np.reshape([clock.time_step for clock in clocks], members)
+            found[LAST_STEP] = np.reshape([scene.clock.time_step for scene in scenes], members)
+        if self._is_cpu and all(scene.origin for scene in scenes):
+            for array in found.values():
+                array.setflags(write=False)
+            self._forget_last()
+            self._last = found, tuple(scenes)
         return found
+
+    def _forget_last(self) -> None:
+        if self._last is not None:
+            fields, scenes = self._last
+            self._remember(self._checksum(fields), tuple(scene.origin for scene in scenes if scene.origin))
+            self._last = None
+
+    def _follows(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
+        """Return the scenes of the last returned state if the given state is the same, and otherwise nothing."""
+        if self._last is None or not values.keys().isdisjoint(("time_step", "rest_density")):
+            return ()
+        fields, scenes = self._last
+        real = self._simulation.precision.numpy
+        if not all(np.array_equal(given[name], np.asarray(array, real)) for name, array in fields.items()):
+            return ()
+        self._last = None
+        return scenes
 
     def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return restart states of all scenes with clocks and origins, but without fields."""
+        if scenes := self._follows(given, values):
+            self._simulation.judged_states.update(scenes)
+            return scenes
+        self._forget_last()
         solver = self._simulation.scene.solver
         times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
         steps = np.full(times.shape, values.get("time_step", 1.0 if solver.chooses else solver.time_step))

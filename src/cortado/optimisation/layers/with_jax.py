@@ -44,6 +44,7 @@ SECOND = "A second derivative is asked for, but there are first ones only: diffe
 MOST_KEPT = 2**30
 TICKET = 2
 """Number of integers in a ticket."""
+NO_TICKETS = np.zeros(TICKET, dtype=np.int32)
 Kept = tuple[Layer, int | None, Any]
 Names = tuple[str, ...]
 Sizes = tuple[int, ...]
@@ -80,7 +81,9 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
     stored, and the returned tickets (entries, 2) or (2,) identify it."""
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
-    number = RESIDUALS.put((own, entries, residual)) if keep else 0
+    if not keep:
+        return found, NO_TICKETS
+    number = RESIDUALS.put((own, entries, residual))
     tickets = np.stack([np.full(entries or 1, number), np.arange(entries or 1)], axis=1).astype(np.int32)
     return found, tickets[0] if entries is None else tickets
 
