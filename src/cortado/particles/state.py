@@ -285,6 +285,7 @@ class Parameters(Arrays):
         super().__init__(arrays)
         self._written: dict[str, np.ndarray | wp.array] = {}
         self._tables: dict[str, np.ndarray] = {}
+        self._numbers: dict[str, wp.array] = {}
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
@@ -295,7 +296,7 @@ class Parameters(Arrays):
         """Write parameters by name, for all members or with a first axis for the members. A value is a vector (d,) or
         vectors (steps, d), a number or an array of numbers, or a Warp array.
 
-        Only `set` and `set_row` may write to these arrays.
+        Only `set`, `set_row` and kernels that take `to_write` may write to these arrays.
         """
         for name, value in values.items():
             array, last = self[name], self._written.get(name)
@@ -316,6 +317,18 @@ class Parameters(Arrays):
             (table[..., : given.shape[-1]] if is_vector else table)[...] = given
             if not array.device.is_cpu:
                 array.assign(table)
+
+    def numbers(self, name: str) -> wp.array:
+        """Return a view of a parameter over time as numbers (members, steps, components)."""
+        if name not in self._numbers:
+            array = self[name]
+            self._numbers[name] = components(array, (*array.shape, wp.types.type_size(array.dtype)))
+        return self._numbers[name]
+
+    def to_write(self, name: str) -> wp.array:
+        """Return `numbers` for a kernel that writes all of them."""
+        self._written[name] = self[name]
+        return self.numbers(name)
 
     def _on_host(self, name: str) -> np.ndarray:
         """Return an array for the numbers of a parameter, which on a CPU has its memory. Third components are 0."""

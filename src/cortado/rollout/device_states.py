@@ -2,7 +2,8 @@
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
+from itertools import pairwise
 from math import prod
 from typing import Any, NoReturn
 
@@ -11,11 +12,11 @@ import warp as wp
 
 from cortado.arrays import as_numbers
 from cortado.calls import FixedDict
-from cortado.device.launching import launch
+from cortado.device.launching import CapturedGraph, KernelLauncher, launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 from cortado.errors import InputError, shown
-from cortado.particles.state import Entry, Parameters, State, components
+from cortado.particles.state import Entry, Parameters, State
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import one_for_each, shapes_of_fields
@@ -275,6 +276,40 @@ def _without_lost(lost: OfLost, state: State) -> State:
     return state
 
 
+def flat_of(arrays: Sequence[Any]) -> wp.array | None:
+    """Return Warp arrays of numbers as one flat array in the same memory, or None unless they lie one after the
+    other."""
+    first = arrays[0]
+    end = first.ptr if isinstance(first, wp.array) else None
+    for array in arrays:
+        if not isinstance(array, wp.array) or (array.ptr, array.dtype) != (end, first.dtype) or not array.is_contiguous:
+            return None
+        end += array.capacity
+    return wp.array(ptr=first.ptr, dtype=first.dtype, shape=sum(a.size for a in arrays), device=first.device)
+
+
+class Packed:
+    """The fields of a state on a GPU, one after the other in a flat array. Doubles are left out."""
+
+    def __init__(self, state: State, dimension: int):
+        narrow, doubles = state.narrow(dimension), {f.name for f in state.fields if f.entry is Entry.DOUBLE}
+        own = {name: array for name, array in narrow.items() if name not in doubles}
+        first, ends = next(iter(own.values())), np.cumsum([0, *(array.size for array in own.values())]).tolist()
+        self.flat = wp.empty(ends[-1], dtype=first.dtype, device=first.device)
+        parts = [self.flat[begin:end] for begin, end in pairwise(ends)]
+        self.views = {name: part.reshape(own[name].shape) for name, part in zip(own, parts, strict=True)}
+        launch = KernelLauncher(1, first.device, record_tape=False)
+        self.read = CapturedGraph(partial(_copy_all, self.views, own), launch)
+        """Copies the state to the flat array."""
+        self.write = CapturedGraph(partial(_copy_all, own, self.views), launch)
+        """Copies the flat array to the state."""
+
+
+def _copy_all(to: Mapping[str, wp.array], given: Mapping[str, wp.array]) -> None:
+    for name, array in to.items():
+        wp.copy(array, given[name])
+
+
 class DeviceRows:
     """Parameters over time as Warp arrays on the device, in the simulation's precision. Numbers have shape (1,).
 
@@ -309,16 +344,14 @@ class DeviceRows:
 
     def write(self, rows: Mapping[str, wp.array], parameters: Parameters) -> None:
         for name, array in rows.items():
-            own = wp.empty_like(parameters[name])
-            numbers = _numbers(own)
+            numbers = parameters.to_write(name)
             launch(self._spread, numbers.shape, numbers.device, given=self._in_three(name, array), rows=numbers)
-            parameters.set({name: own})
 
     def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
         """Sum the adjoints ``found`` over all scenes and time steps with the same value."""
         adjoints = {}
         for name, array in rows.items():
-            bars, shape = _numbers(found[name]), self._in_three(name, array).shape
+            bars, shape = found.numbers(name), self._in_three(name, array).shape
             of_steps = self._folded(bars, (bars.shape[0], *shape[1:]))
             for member, number in lost.items():
                 of_steps[member].fill_(number)
@@ -336,10 +369,6 @@ class DeviceRows:
         of_each = array.ndim == self._simulation.known[name].rank + 2  # otherwise all scenes share the rows
         members = len(array) if of_each else 1
         return array.contiguous().reshape((members, array.size // (members * each), each))
-
-
-def _numbers(array: wp.array) -> wp.array:
-    return components(array, (*array.shape, wp.types.type_size(array.dtype)))
 
 
 @cache

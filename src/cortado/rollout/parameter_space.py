@@ -70,7 +70,7 @@ class ParameterSpace:
         return found
 
     def _judge(self, values: Arrays) -> None:
-        """Raise `InputError` for values that a run cannot take, and warn, unless the last judged values were the same."""
+        """Raise `InputError` for values that a run cannot take, or warn, unless the last values were the same."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()
         changed = [name for name, value in values.items() if is_first or not np.array_equal(value, last[name])]

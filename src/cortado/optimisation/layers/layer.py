@@ -19,7 +19,7 @@ import warp as wp
 from cortado.calls import counted
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.state import Entry, State
-from cortado.rollout.device_states import DeviceRows, DeviceState, HostStates, OfLost, scenes_after
+from cortado.rollout.device_states import DeviceRows, DeviceState, HostStates, OfLost, Packed, flat_of, scenes_after
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
@@ -65,7 +65,8 @@ class Layer(ABC):
 
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Return the results of the layer. If ``keep`` is true, also return a residual for `pull` and `push`."""
+        """Return the results of the layer. If ``keep`` is true, also return a residual for `pull` and `push`. The next
+        call of the layer may overwrite Warp arrays."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
@@ -121,7 +122,7 @@ class OneByOne(Layer):
         return {name: (self._size, *shape) for name, shape in self._layer.outputs().items()}
 
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        found = [self._evaluated(own, keep) for own in self._each(given)]
+        found = [(copied(one), residual) for one, residual in (self._evaluated(own, keep) for own in self._each(given))]
         lost = {number: one for number, (_, one) in enumerate(found) if isinstance(one, Lost)}
         if lost:
             first, one = next(iter(lost.items()))
@@ -182,13 +183,15 @@ def rows(given: Named, chosen: int | np.ndarray) -> dict[str, Array]:
 
 
 def stacked(found: Iterable[Named]) -> dict[str, Array]:
-    """Stack the arrays of several tables by name, along a new first axis."""
-    tables = list(found)
+    """Stack the arrays of several tables by name, along a new first axis. Each table is copied as it comes, because the
+    next evaluation of a layer may overwrite it."""
+    tables = [copied(table) for table in found]
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
 
-def _copy(array: Array) -> Array:
-    return wp.clone(array, requires_grad=False) if isinstance(array, wp.array) else np.array(array)
+def copied(found: Named) -> Named:
+    """Copy the Warp arrays of a table."""
+    return {name: wp.clone(array) if isinstance(array, wp.array) else array for name, array in found.items()}
 
 
 def _rows(array: Array, chosen: int | np.ndarray) -> Array:
@@ -221,6 +224,7 @@ class NamedStates(HostStates):
         super().__init__(simulation)
         self._simulation: Simulation = simulation
         self._space, self._is_cpu = ParameterSpace(simulation, 0), bool(simulation.device.is_cpu)
+        self._all_packed = dict[State, Packed]()
         self._last: tuple[Named, tuple[RestartState, ...]] | None = None
         """On a CPU, the last returned state, and its clocks and origins."""
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
@@ -245,7 +249,8 @@ class NamedStates(HostStates):
         space.begin(rollout, values, varied, scenes, lambda first: self._copy_to(first, state))
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
-        """Copy the state of a rollout after ``steps`` steps to named arrays. Lost scenes get NaN."""
+        """Return the state of a rollout after ``steps`` steps as named arrays. Lost scenes get NaN. On a GPU, the next
+        reading overwrites the arrays."""
         return self._returned(self.read(state, dict.fromkeys(rollout.lost, np.nan)), scenes_after(rollout, steps))
 
     def arrays(self, state: DeviceState) -> Named:
@@ -269,17 +274,32 @@ class NamedStates(HostStates):
         return self._numbers(given, STATE_TIME).reshape(self.shapes[STATE_TIME])
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        views = state.narrow(self._simulation.dimension).items()
-        doubles = () if self._is_cpu else [field.name for field in state.fields if field.entry is Entry.DOUBLE]
-        found = {name: _copy(on_host(array) if name in doubles else array) for name, array in views}
+        views, packed = state.narrow(self._simulation.dimension), self._packed(state)
+        if packed is not None:
+            packed.read()
+        kept = {} if packed is None else packed.views
+        found = {name: kept[name] if name in kept else np.array(on_host(array)) for name, array in views.items()}
         for b, number in lost.items():
             for array in found.values():
                 member = array[b]
                 member.fill(number) if isinstance(member, np.ndarray) else member.fill_(number)
         return found
 
+    def _packed(self, state: State) -> Packed | None:
+        """Return the packed arrays of a state on a GPU, which its next reading or writing overwrites."""
+        if self._is_cpu:
+            return None
+        return kept_or_made(self._all_packed, state, lambda own: Packed(own, self._simulation.dimension), 8)
+
     def _copy_to(self, state: State, given: Named) -> None:
-        for name, own in state.narrow(self._simulation.dimension).items():
+        views, packed = state.narrow(self._simulation.dimension), self._packed(state)
+        if packed is not None and all(name in given for name in packed.views):
+            flat = flat_of([given[name] for name in packed.views])
+            if flat is not None and (flat.dtype, flat.device) == (packed.flat.dtype, packed.flat.device):
+                wp.copy(packed.flat, flat)
+                packed.write()
+                views = {name: own for name, own in views.items() if name not in packed.views}
+        for name, own in views.items():
             if name not in given:
                 continue
             array = given[name]

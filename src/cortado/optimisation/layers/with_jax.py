@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from cortado.arrays import as_precise_numbers
 from cortado.device.threads import WARP
 from cortado.errors import CortadoError, InputError, LibraryMissingError, Words
-from cortado.optimisation.layers.layer import Array, Layer, Named, on_host, rows, stacked
+from cortado.optimisation.layers.layer import Array, Layer, Named, kept_or_made, on_host, rows, stacked
 from cortado.optimisation.layers.user_functions import Bridge
+from cortado.rollout.device_states import flat_of
 
 try:
     import jax
@@ -106,7 +107,7 @@ def derivative(
         return derived(residual, others)
     order = np.argsort(places, kind="stable").reshape(mapped or 1, -1).T  # (directions, entries of the layer)
     turns: Sequence[Any] = [row if mapped is not None else int(row[0]) for row in order]
-    whole = stacked([derived(residual, rows(others, turn)) for turn in turns])
+    whole = stacked(derived(residual, rows(others, turn)) for turn in turns)
     if mapped is not None:
         whole = {name: array.reshape((-1, *array.shape[2:])) for name, array in whole.items()}
     return rows(whole, np.argsort(order.reshape(-1)))
@@ -285,7 +286,7 @@ def _array(array: Any) -> Array:
 
 def _jax_array(found: Array, wanted: Any) -> Any:
     if isinstance(found, wp.array) and not found.device.is_cpu:
-        return jnp.from_dlpack(found).astype(wanted.dtype).reshape(wanted.shape)
+        return jnp.from_dlpack(wp.clone(found)).astype(wanted.dtype).reshape(wanted.shape)
     own = found.numpy() if isinstance(found, wp.array) else np.asarray(found)
     return jnp.array(own.reshape(wanted.shape), dtype=wanted.dtype)
 
@@ -318,14 +319,21 @@ class Packing:
         """Numbers of the arrays of each data type."""
         for k, (_, dtype) in enumerate(kinds):
             self.groups.setdefault(str(dtype), []).append(k)
-        self.ends = {d: np.cumsum([0, *(prod(self._shapes[k]) for k in own)]).tolist() for d, own in self.groups.items()}
+        self._views: dict[Any, list[Any]] = {}
+        sizes = {dtype: [prod(self._shapes[k]) for k in group] for dtype, group in self.groups.items()}
+        self.ends = {dtype: np.cumsum([0, *own]).tolist() for dtype, own in sizes.items()}
 
     @property
     def sizes(self) -> list[int]:
         return [ends[-1] for ends in self.ends.values()]
 
     def unpacked(self, whole: Sequence[Any]) -> list[Any]:
-        """Return views of flat arrays in the shapes of the packed arrays."""
+        """Return views of flat arrays in the shapes of the packed arrays. Programs use the same few buffers again."""
+        if all(isinstance(flat, wp.array) for flat in whole):
+            return kept_or_made(self._views, tuple(flat.ptr for flat in whole), lambda _: self._cut(whole), 8)
+        return self._cut(whole)
+
+    def _cut(self, whole: Sequence[Any]) -> list[Any]:
         found: list[Any] = [None] * len(self._shapes)
         for flat, (dtype, group) in zip(whole, self.groups.items(), strict=True):
             for k, first, end in zip(group, self.ends[dtype], self.ends[dtype][1:], strict=False):
@@ -340,15 +348,20 @@ def _call(
     """Apply a function to flat Warp arrays, and write its results to flat Warp arrays."""
     found = function(given.unpacked([flat.numpy() if flat.device.is_cpu else flat for flat in whole]))
     for result, (dtype, group) in zip(results, made.groups.items(), strict=True):
-        flat = result.numpy() if result.device.is_cpu else None
-        for k, first, end in zip(group, made.ends[dtype], made.ends[dtype][1:], strict=False):
-            own = found[k]
-            if flat is not None:
-                flat[first:end] = on_host(own).reshape(-1)
-            elif isinstance(own, wp.array) and own.dtype == result.dtype and own.device == result.device:
-                wp.copy(result[first:end], own.flatten())
+        numbers = result.numpy() if result.device.is_cpu else None
+        places = list(zip(group, made.ends[dtype], made.ends[dtype][1:], strict=False))
+        there = [k for k, *_ in places if isinstance(found[k], wp.array) and found[k].device == result.device]
+        flat = flat_of([found[k] for k in there]) if numbers is None and there == group[: len(there)] else None
+        if flat is not None and flat.dtype == result.dtype:
+            wp.copy(result, flat, count=flat.size)
+            places = places[len(there) :]
+        for k, first, end in places:
+            if numbers is not None:
+                numbers[first:end] = on_host(found[k]).reshape(-1)
+            elif k in there and found[k].dtype == result.dtype:
+                wp.copy(result[first:end], found[k].flatten())
             else:
-                result[first:end].assign(on_host(own).reshape(-1))
+                result[first:end].assign(on_host(found[k]).reshape(-1))
 
 
 _NUMBERS = count(1)

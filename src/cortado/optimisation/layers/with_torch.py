@@ -225,8 +225,7 @@ def _tensors(layer: Layer, found: Named, shapes: dict[str, tuple[int, ...]]) -> 
 
 
 def _tensor(array: Array, shape: Sequence[int], dtype: Any, device: Any) -> Any:
-    """Convert an array to a tensor. The tensor shares the memory of the array if type and device allow it."""
-    own = wp.to_torch(array) if isinstance(array, wp.array) else torch.from_numpy(np.array(array))
+    own = wp.to_torch(wp.clone(array)) if isinstance(array, wp.array) else torch.from_numpy(np.array(array))
     assert own.numel() == prod(shape)
     return own.to(dtype=dtype, device=device).reshape(tuple(shape))
 
