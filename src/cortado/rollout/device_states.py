@@ -279,8 +279,10 @@ def _without_lost(lost: OfLost, state: State) -> State:
 def flat_of(arrays: Sequence[Any]) -> wp.array | None:
     """Return Warp arrays of numbers as one flat array in the same memory, or None unless they lie one after the
     other."""
-    first = arrays[0]
-    end = first.ptr if isinstance(first, wp.array) else None
+    first = arrays[0] if arrays else None
+    if not isinstance(first, wp.array):
+        return None
+    end = first.ptr
     for array in arrays:
         if not isinstance(array, wp.array) or (array.ptr, array.dtype) != (end, first.dtype) or not array.is_contiguous:
             return None
@@ -344,8 +346,11 @@ class DeviceRows:
 
     def write(self, rows: Mapping[str, wp.array], parameters: Parameters) -> None:
         for name, array in rows.items():
-            numbers = parameters.to_write(name)
-            launch(self._spread, numbers.shape, numbers.device, given=self._in_three(name, array), rows=numbers)
+            numbers, given = parameters.to_write(name), self._in_three(name, array)
+            if given.shape[:2] == numbers.shape[:2]:  # third components are 0
+                wp.copy(numbers[:, :, : given.shape[2]] if given.shape != numbers.shape else numbers, given)
+            else:
+                launch(self._spread, numbers.shape, numbers.device, given=given, rows=numbers)
 
     def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
         """Sum the adjoints ``found`` over all scenes and time steps with the same value."""

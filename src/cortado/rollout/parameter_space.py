@@ -202,7 +202,7 @@ class ParameterSpace:
         rollout.begin_evaluation()
         rollout.clocks = [state.clock for state in states]
         write(rollout.initial)
-        if "gravity" in members[0]:
+        if "gravity" in members[0] and not np.isnan(members[0]["gravity"]).any():  # NaN stands in for a Warp array
             rows = np.empty((len(members), max(self._steps, 1), self._simulation.dimension))
             for own, member in zip(rows, members, strict=True):
                 own[:] = member["gravity"]

@@ -219,7 +219,7 @@ class Rollout(Staying):
                 for number, new_state in enumerate(chunk[: lost[0].step - step] if stops else chunk, step + 1):
                     if observe is not None:
                         observe(number, new_state)
-                if keep and not stops:
+                if keep and not stops and step + 1 < self.steps:  # no pass back begins at the last state
                     self._checkpoints.keep(step, chunk, self._series, len(self._chunk), self._spare)
                 if stops:
                     step = lost[0].step + 1

@@ -111,12 +111,12 @@ class AdjointGrowth:
         self._begun = 0.0, 0.0
         self._warned = False
 
-    def follow(self, rollout: Rollout, last: State, first: State) -> None:
-        """Add the adjoints of the ``last`` and the ``first`` state of a call. Warn once if the growth exceeds
-        `MOST_GROWTH`."""
+    def follow(self, rollout: Rollout, squares: np.ndarray) -> None:
+        """Add the adjoints of the last and the first state of a call, given `sums_of_squares` of both. Warn
+        once if the growth exceeds `MOST_GROWTH`."""
         size = float(rollout.time_steps[0])
         start, end = (rollout.clocks[0].after(steps, size).time for steps in (0, rollout.steps))
-        into, out = ((_norm(bar.positions), _norm(bar.velocities)) for bar in (last, first))
+        into, out = np.sqrt(squares, dtype=np.float64).reshape(2, 2).tolist()
         if not (abs(end - self._reached) < 0.5 * (end - start) / rollout.steps and any(self._begun)):
             self._begun, self._ended, self._within, self._steps = into, end, 0.0, 0
         self._reached, self._steps = start, self._steps + rollout.steps
@@ -134,9 +134,13 @@ class AdjointGrowth:
             )
 
 
-def _norm(bar: wp.array) -> float:
-    numbers = bar.numpy().reshape(-1) if bar.device.is_cpu else None
-    return math.sqrt(wp.utils.array_inner(bar, bar) if numbers is None else numbers @ numbers)
+def sums_of_squares(*states: State) -> wp.array:
+    """Compute the sum of the squares of the positions and of the velocities of each state. A GPU is not waited for."""
+    arrays = [array for state in states for array in (state.positions, state.velocities)]
+    found = wp.empty(len(arrays), dtype=arrays[0].dtype._wp_scalar_type_, device=arrays[0].device)
+    for k, array in enumerate(arrays):
+        wp.utils.array_inner(array, array, out=found[k : k + 1])
+    return found
 
 
 class Stepper:
@@ -235,8 +239,7 @@ class Stepper:
         values = residual.values
         residual.evaluation.bring_back()
         first = rollout.backward(adjoint, {rollout.steps: self._bar})
-        if rollout.steps:
-            self._simulation.__dict__.setdefault("_growth", AdjointGrowth()).follow(rollout, self._bar, first)
+        sizes = sums_of_squares(self._bar, first)
         found = adjoint.parameters()
         earlier = space.time_adjoints(rollout, values, found)
         before = (earlier[0] if self._simulation.batch is None else earlier) + times
@@ -246,7 +249,10 @@ class Stepper:
         lost = of_lost(rollout, self._bar, times)
         time_bar = without_lost(lost, {STATE_TIME: before})
         rows = self._rows.adjoints(residual.rows, found, lost)
-        return {**place.read(first, lost), **time_bar}, {**without_lost(lost, own), **rows}
+        state = {**place.read(first, lost), **time_bar}
+        if rollout.steps:
+            self._simulation.__dict__.setdefault("_growth", AdjointGrowth()).follow(rollout, sizes.numpy())
+        return state, {**without_lost(lost, own), **rows}
 
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:

@@ -1,10 +1,12 @@
 """Layers that compute steps, the loss of a problem, sensor readings, and pictures."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from cortado.arrays import check_steps
 from cortado.device.threads import WARP, Turn, in_turn
@@ -18,7 +20,6 @@ from cortado.optimisation.layers.layer import (
     STATE,
     Array,
     Layer,
-    LayerParameters,
     Named,
     OneByOne,
     Shapes,
@@ -31,6 +32,7 @@ from cortado.optimisation.layers.layer import (
 from cortado.problem import Problem
 from cortado.render import Renderer
 from cortado.rollout.checkpoints import MEMORY_BUDGET
+from cortado.rollout.device_states import DeviceRows
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Residual, Rollout
 from cortado.rollout.stepper import Stepper, StepResidual
@@ -42,6 +44,54 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.simulation import Simulation
 
 LOSS, READING, PICTURE = "loss", "reading", "picture"
+
+
+class LayerParameters:
+    """A converter of a layer's parameters for problems and steppers.
+
+    ``each`` is True if the simulation is a batch of evaluations of a layer. All arrays then have one entry for each
+    evaluation. If ``each`` is False, a batch accepts parameters in all shapes of `docs/batches.md`.
+    """
+
+    def __init__(self, simulation: Simulation, steps: int, each: bool):
+        self._simulation, self._each = simulation, each
+        self._space = ParameterSpace(simulation, steps)
+        self._rows = DeviceRows(simulation, self._space)
+
+    def check(self, given: Shapes, with_state: bool) -> None:
+        for name, shape in part(given, PARAMETER).items():
+            shapes = self._space.shapes(name)
+            if with_state and name in self._simulation.known.state:
+                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
+            if shape not in shapes:
+                raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
+
+    def values(self, given: Named) -> Arrays:
+        own = part(given, PARAMETER)
+        return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
+
+    def on_device(self, given: Named) -> dict[str, Array]:
+        own = part(given, PARAMETER)
+        stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
+        others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
+        return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
+
+    def _shaped(self, name: str, array: Array) -> Array:
+        shapes = self._space.shapes(name)
+        if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
+            return array.reshape((array.shape[0], 1, *array.shape[1:]))
+        is_number = isinstance(array, np.ndarray) and array.shape == (1,) and (1,) not in shapes
+        return array.reshape(()) if is_number else array
+
+    def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
+        """Return derivatives in the shapes of ``values``. If scenes share a value, their derivatives are summed."""
+        shared = {}
+        for name, bar in found.items():
+            if isinstance(bar, np.ndarray):
+                shape = values[name].shape
+                is_shared = bar.size != int(np.prod(shape))
+                shared[name] = (bar.sum(axis=0) if is_shared else bar).reshape(shape)
+        return named(PARAMETER, {**found, **shared})
 
 
 class OfSimulation(Layer):

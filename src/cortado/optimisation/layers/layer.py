@@ -19,7 +19,7 @@ import warp as wp
 from cortado.calls import counted
 from cortado.errors import CortadoWarning, DivergedError, InputError
 from cortado.particles.state import Entry, State
-from cortado.rollout.device_states import DeviceRows, DeviceState, HostStates, OfLost, Packed, flat_of, scenes_after
+from cortado.rollout.device_states import DeviceState, HostStates, OfLost, Packed, flat_of, scenes_after
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import check_clock, origin_of, shapes_of_fields
@@ -375,8 +375,17 @@ class NamedStates(HostStates):
         return [RestartState(*own).fixed() for own in zip(each, clocks, origins, strict=True)]
 
     def _numbers(self, given: Named, name: str) -> np.ndarray:
-        members = self._simulation.batch or 1
-        return on_host(given[name]).astype(np.float64).reshape(members) if name in given else np.zeros(members)
+        members, array = self._simulation.batch or 1, given.get(name)
+        if isinstance(array, wp.array) and array.device.is_cuda and array.dtype == self._pinned.dtype:
+            wp.copy(self._pinned, array)
+            wp.synchronize_stream(array.device)
+            array = self._pinned
+        return np.zeros(members) if array is None else on_host(array).astype(np.float64).reshape(members)
+
+    @cached_property
+    def _pinned(self) -> wp.array:
+        members, real = self._simulation.batch or 1, self._simulation.precision.real
+        return wp.empty(members, dtype=real, device="cpu", pinned=True)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
         """Return the clock of a state at a time [s], which may be rounded. If the time is a multiple of the time step
@@ -413,51 +422,3 @@ def named_states(simulation: Simulation) -> NamedStates:
     found: NamedStates = simulation.__dict__.get("_named_states") or NamedStates(simulation)
     simulation.__dict__["_named_states"] = found
     return found
-
-
-class LayerParameters:
-    """A converter of a layer's parameters for problems and steppers.
-
-    ``each`` is True if the simulation is a batch of evaluations of a layer. All arrays then have one entry for each
-    evaluation. If ``each`` is False, a batch accepts parameters in all shapes of `docs/batches.md`.
-    """
-
-    def __init__(self, simulation: Simulation, steps: int, each: bool):
-        self._simulation, self._each = simulation, each
-        self._space = ParameterSpace(simulation, steps)
-        self._rows = DeviceRows(simulation, self._space)
-
-    def check(self, given: Shapes, with_state: bool) -> None:
-        for name, shape in part(given, PARAMETER).items():
-            shapes = self._space.shapes(name)
-            if with_state and name in self._simulation.known.state:
-                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
-            if shape not in shapes:
-                raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
-
-    def values(self, given: Named) -> Arrays:
-        own = part(given, PARAMETER)
-        return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
-
-    def on_device(self, given: Named) -> dict[str, Array]:
-        own = part(given, PARAMETER)
-        stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
-        others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
-        return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
-
-    def _shaped(self, name: str, array: Array) -> Array:
-        shapes = self._space.shapes(name)
-        if self._each and name in self._simulation.known.over_time and array.ndim == len(shapes[0]) + 1:
-            return array.reshape((array.shape[0], 1, *array.shape[1:]))
-        is_number = isinstance(array, np.ndarray) and array.shape == (1,) and (1,) not in shapes
-        return array.reshape(()) if is_number else array
-
-    def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
-        """Return derivatives in the shapes of ``values``. If scenes share a value, their derivatives are summed."""
-        shared = {}
-        for name, bar in found.items():
-            if isinstance(bar, np.ndarray):
-                shape = values[name].shape
-                is_shared = bar.size != int(np.prod(shape))
-                shared[name] = (bar.sum(axis=0) if is_shared else bar).reshape(shape)
-        return named(PARAMETER, {**found, **shared})
