@@ -345,7 +345,7 @@ def test_an_error_that_is_not_ours_has_its_traceback(jax, layer, problem, capfd,
     monkeypatch.setattr("cortado.optimisation.layers.with_jax.evaluate", lambda *given: 1 / 0)
     with pytest.raises(Exception, match="ZeroDivisionError"):
         loss(jax.numpy.asarray(10.0)).block_until_ready()
-    assert "Traceback" in capfd.readouterr().out
+    assert "Traceback" in capfd.readouterr().err
 
 
 def test_float64_needs_a_jax_that_has_it(jax, layer, problem):

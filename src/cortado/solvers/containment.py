@@ -234,9 +234,9 @@ class Containment:
     def lost(self) -> dict[int, Lost]:
         """Return the lost particles since `reset`, by scene number."""
         steps = self.bad_step_copy.read()
-        members = np.flatnonzero(steps >= 0).tolist()
-        if not members:
+        if steps.max() < 0:
             return {}
+        members = np.flatnonzero(steps >= 0).tolist()
         particles, counts = self.bad_particle.numpy(), self._count.numpy()
         return {b: Lost(int(steps[b]), int(particles[b]), int(counts[b]) - 1) for b in members}
 

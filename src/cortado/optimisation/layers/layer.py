@@ -225,8 +225,8 @@ class NamedStates(HostStates):
         self._simulation: Simulation = simulation
         self._space, self._is_cpu = ParameterSpace(simulation, 0), bool(simulation.device.is_cpu)
         self._all_packed = dict[State, Packed]()
-        self._last: tuple[Named, tuple[RestartState, ...]] | None = None
-        """On a CPU, the last returned state, and its clocks and origins."""
+        self._last: tuple[dict[str, bytes], tuple[RestartState, ...]] | None = None
+        """On a CPU, the numbers of the last returned state, and its clocks and origins."""
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
         """Origins of the particles of valid states, by the checksum of the state."""
 
@@ -317,28 +317,29 @@ class NamedStates(HostStates):
         if LAST_STEP in self.shapes:
             found[LAST_STEP] = np.reshape([scene.clock.time_step for scene in scenes], members)
         if self._is_cpu and all(scene.origin for scene in scenes):
-            for array in found.values():
-                array.setflags(write=False)
             self._forget_last()
-            self._last = found, tuple(scenes)
+            self._last = self._bytes(found), tuple(scenes)
         return found
 
     def _forget_last(self) -> None:
         if self._last is not None:
-            fields, scenes = self._last
-            self._remember(self._checksum(fields), tuple(scene.origin for scene in scenes if scene.origin))
+            numbers, scenes = self._last
+            self._remember(self._checksum(numbers), tuple(scene.origin for scene in scenes if scene.origin))
             self._last = None
 
     def _follows(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return the scenes of the last returned state if the given state is the same, and otherwise nothing."""
         if self._last is None or not values.keys().isdisjoint(("time_step", "rest_density")):
             return ()
-        fields, scenes = self._last
-        real = self._simulation.precision.numpy
-        if not all(np.array_equal(given[name], np.asarray(array, real)) for name, array in fields.items()):
+        numbers, scenes = self._last
+        if self._bytes(given) != numbers:
             return ()
         self._last = None
         return scenes
+
+    def _bytes(self, given: Named) -> dict[str, bytes]:
+        real = self._simulation.precision.numpy
+        return {name: np.asarray(given[name], dtype=real).tobytes() for name in self.shapes}
 
     def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return restart states of all scenes with clocks and origins, but without fields."""
@@ -358,7 +359,7 @@ class NamedStates(HostStates):
 
     def _origins(self, given: Named, clocks: list[Clock], values: Arrays) -> tuple[Origin, ...]:
         own = {name: values[name] for name in ("rest_density",) if name in values}
-        key = self._checksum(given) if self._is_cpu else np.asarray(own.get("rest_density", ())).tobytes()
+        key = self._checksum(self._bytes(given)) if self._is_cpu else np.asarray(own.get("rest_density", ())).tobytes()
         if key not in self._known:
             if self._is_cpu:
                 self._space.check_restarts(self._states(given, clocks, [None] * len(clocks)), own)
@@ -401,11 +402,8 @@ class NamedStates(HostStates):
         while len(self._known) > 256:
             self._known.popitem(last=False)
 
-    def _checksum(self, fields: Named) -> bytes:
-        found, real = blake2b(digest_size=16), self._simulation.precision.numpy
-        for name in self.fields:
-            found.update(np.ascontiguousarray(fields[name], dtype=real).data)
-        return found.digest()
+    def _checksum(self, numbers: Mapping[str, bytes]) -> bytes:
+        return blake2b(b"".join(numbers[name] for name in self.fields), digest_size=16).digest()
 
 
 def check_state(given: Shapes, wanted: Shapes) -> None:

@@ -6,38 +6,33 @@ Jacobian-vector product. The transpose of the second primitive is a third primit
 `jax.jvp` and `jax.grad` therefore use the same rules.
 
 JAX programs contain only arrays. Residuals are therefore stored in `RESIDUALS`, and an array called the ticket contains
-the number of a residual. Compiled programs call Python by Warp's foreign functions.
+the number of a residual.
 """
 
-import inspect
-import sys
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from functools import cache, partial
+from functools import partial
 from itertools import count
 from math import prod
 from threading import Lock
 from typing import Any, Literal
-from uuid import uuid4
-from weakref import finalize
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from cortado.arrays import as_precise_numbers
-from cortado.device.threads import WARP
-from cortado.errors import CortadoError, InputError, LibraryMissingError, Words
-from cortado.optimisation.layers.layer import Array, Layer, Named, kept_or_made, on_host, rows, stacked
+from cortado.errors import InputError, LibraryMissingError, Words
+from cortado.optimisation.layers.layer import Array, Layer, Named, on_host, rows, stacked
 from cortado.optimisation.layers.user_functions import Bridge
-from cortado.rollout.device_states import flat_of
 
 try:
     import jax
     import jax.numpy as jnp
     from jax.extend.core import Primitive
     from jax.interpreters import ad, batching, mlir
+
+    from cortado.optimisation.layers.foreign import ForeignFunction
 except ModuleNotFoundError as error:
     raise LibraryMissingError("JAX", "jax") from error
 
@@ -289,126 +284,3 @@ def _jax_array(found: Array, wanted: Any) -> Any:
         return jnp.from_dlpack(wp.clone(found)).astype(wanted.dtype).reshape(wanted.shape)
     own = found.numpy() if isinstance(found, wp.array) else np.asarray(found)
     return jnp.array(own.reshape(wanted.shape), dtype=wanted.dtype)
-
-
-class ForeignFunction:
-    """A Python function of arrays for compiled programs. Arrays of one data type are passed in one buffer, because a
-    call costs more for each buffer than for its numbers."""
-
-    def __init__(self, function: Callable[[list[Array]], Sequence[Array]]):
-        self._function, self._number = function, next(_NUMBERS)
-        finalize(self, _let_go, self._number)
-
-    @WARP
-    def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        given, made = Packing([(a.shape, a.dtype) for a in arrays]), Packing([(r.shape, r.dtype) for r in results])
-        own = Packing(list(zip(shapes, (result.dtype for result in results), strict=True)))
-        _FUNCTIONS[self._number] = partial(_call, self._function, given, own)
-        packed = [jnp.concatenate([arrays[k].reshape(-1) for k in group]) for group in given.groups.values()]
-        dims = {f"out_{k}": size for k, size in enumerate(made.sizes)}
-        found = _callable(tuple(given.groups), tuple(made.groups))(*packed, self._number, output_dims=dims)
-        return made.unpacked(found)
-
-
-class Packing:
-    """The places of arrays with known shapes and data types in one flat array for each data type."""
-
-    def __init__(self, kinds: Sequence[tuple[Sizes, Any]]):
-        self._shapes = [shape for shape, _ in kinds]
-        self.groups: dict[str, list[int]] = {}
-        """Numbers of the arrays of each data type."""
-        for k, (_, dtype) in enumerate(kinds):
-            self.groups.setdefault(str(dtype), []).append(k)
-        self._views: dict[Any, list[Any]] = {}
-        sizes = {dtype: [prod(self._shapes[k]) for k in group] for dtype, group in self.groups.items()}
-        self.ends = {dtype: np.cumsum([0, *own]).tolist() for dtype, own in sizes.items()}
-
-    @property
-    def sizes(self) -> list[int]:
-        return [ends[-1] for ends in self.ends.values()]
-
-    def unpacked(self, whole: Sequence[Any]) -> list[Any]:
-        """Return views of flat arrays in the shapes of the packed arrays. Programs use the same few buffers again."""
-        if all(isinstance(flat, wp.array) for flat in whole):
-            return kept_or_made(self._views, tuple(flat.ptr for flat in whole), lambda _: self._cut(whole), 8)
-        return self._cut(whole)
-
-    def _cut(self, whole: Sequence[Any]) -> list[Any]:
-        found: list[Any] = [None] * len(self._shapes)
-        for flat, (dtype, group) in zip(whole, self.groups.items(), strict=True):
-            for k, first, end in zip(group, self.ends[dtype], self.ends[dtype][1:], strict=False):
-                shape = self._shapes[k]
-                found[k] = flat[first:end].reshape((shape or (1,)) if isinstance(flat, wp.array) else shape)
-        return found
-
-
-def _call(
-    function: Callable[[list[Array]], Sequence[Array]], given: Packing, made: Packing, whole: Arrays, results: Arrays
-) -> None:
-    """Apply a function to flat Warp arrays, and write its results to flat Warp arrays."""
-    found = function(given.unpacked([flat.numpy() if flat.device.is_cpu else flat for flat in whole]))
-    for result, (dtype, group) in zip(results, made.groups.items(), strict=True):
-        numbers = result.numpy() if result.device.is_cpu else None
-        places = list(zip(group, made.ends[dtype], made.ends[dtype][1:], strict=False))
-        there = [k for k, *_ in places if isinstance(found[k], wp.array) and found[k].device == result.device]
-        flat = flat_of([found[k] for k in there]) if numbers is None and there == group[: len(there)] else None
-        if flat is not None and flat.dtype == result.dtype:
-            wp.copy(result, flat, count=flat.size)
-            places = places[len(there) :]
-        for k, first, end in places:
-            if numbers is not None:
-                numbers[first:end] = on_host(found[k]).reshape(-1)
-            elif k in there and found[k].dtype == result.dtype:
-                wp.copy(result[first:end], found[k].flatten())
-            else:
-                result[first:end].assign(on_host(found[k]).reshape(-1))
-
-
-_NUMBERS = count(1)
-_FUNCTIONS: dict[int, Callable[[Arrays, Arrays], None]] = {}
-_GONE: deque[int] = deque()
-
-
-def _let_go(number: int) -> None:
-    _GONE.append(number)
-    while len(_GONE) > 64:
-        _FUNCTIONS.pop(_GONE.popleft(), None)
-
-
-@cache
-def _callable(given: Names, made: Names) -> Any:
-    """Make a JAX function that calls one of `_FUNCTIONS` with flat arrays of the given data types."""
-
-    def call(*arguments: Any) -> None:
-        arrays, number, results = arguments[: len(given)], arguments[len(given)], arguments[len(given) + 1 :]
-        with WARP, _in_order(results[0].device):
-            try:
-                _FUNCTIONS[number](arrays, results)
-            except CortadoError as error:
-                raise error.with_traceback(None) from None
-
-    types = {f"in_{k}": wp.array(dtype=getattr(wp, dtype)) for k, dtype in enumerate(given)}
-    types |= {"number": int} | {f"out_{k}": wp.array(dtype=getattr(wp, dtype)) for k, dtype in enumerate(made)}
-    call.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in types]
-    )
-    call.__annotations__ = types
-    call.__qualname__ = f"call_{uuid4().hex}"  # for programs that JAX caches on disk, of other processes
-    found = wp.jax_callable(call, len(made), wp.JaxCallableGraphMode.NONE, vmap_method=None)
-    vars(sys.modules[type(found).__module__])["print"] = _print
-    return found
-
-
-def _print(*words: Any, **options: Any) -> None:
-    if not isinstance(sys.exc_info()[1], CortadoError):
-        print(*words, **options)
-
-
-def _in_order(device: Any) -> AbstractContextManager[Any]:
-    """Return a context with a separate GPU stream that is synchronised with the program's stream at both ends."""
-    return nullcontext() if device.is_cpu else wp.ScopedStream(_stream(device.alias), sync_enter=True, sync_exit=True)
-
-
-@cache
-def _stream(device: str) -> Any:
-    return wp.Stream(device)
