@@ -119,7 +119,7 @@ def _array_at(address: int, size: int, dtype: str, device: Any) -> Any:
     if device is not None:
         return wp.array(ptr=address, dtype=getattr(wp, dtype), shape=(size,), device=device)
     kind = np.dtype(dtype)
-    memory = (ctypes.c_char * (size * kind.itemsize)).from_address(address) if size else b""
+    memory: Any = (ctypes.c_char * (size * kind.itemsize)).from_address(address) if size else b""
     return np.frombuffer(memory, dtype=kind)
 
 
