@@ -98,7 +98,7 @@ class Packing:
                 view, own = views[k], found[k]
                 if isinstance(view, np.ndarray):
                     view[...] = on_host(own).reshape(view.shape)
-                elif isinstance(own, wp.array) and (own.dtype, own.device) == (view.dtype, view.device):
+                elif isinstance(own, wp.array) and own.dtype == view.dtype:
                     wp.copy(view, own.reshape(view.shape))
                 else:
                     view.assign(on_host(own).reshape(view.shape))

@@ -314,6 +314,9 @@ class NamedStates(HostStates):
         """Add the clocks of all scenes to the fields of a state. On a CPU, remember the state as valid."""
         members, found = self.shapes[STATE_TIME], dict(fields)
         found[STATE_TIME] = np.reshape([scene.clock.time for scene in scenes], members)
+        if not self._is_cpu:
+            self._later.numpy().reshape(members)[...] = found[STATE_TIME]
+            found[STATE_TIME] = self._later
         if LAST_STEP in self.shapes:
             found[LAST_STEP] = np.reshape([scene.clock.time_step for scene in scenes], members)
         if self._is_cpu and all(scene.origin for scene in scenes):
@@ -387,6 +390,11 @@ class NamedStates(HostStates):
     def _pinned(self) -> wp.array:
         members, real = self._simulation.batch or 1, self._simulation.precision.real
         return wp.empty(members, dtype=real, device="cpu", pinned=True)
+
+    @cached_property
+    def _later(self) -> wp.array:
+        """Times of the last returned state. The next call waits for the device before it writes here."""
+        return wp.empty_like(self._pinned, pinned=True)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
         """Return the clock of a state at a time [s], which may be rounded. If the time is a multiple of the time step
