@@ -1,6 +1,8 @@
 """Flows that a fluid has to be pulled in, without walls or with."""
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from cortado import Scene, Simulation
@@ -55,10 +57,6 @@ def taylor_green(across, reynolds, time=1.0, pressure=True, solver=PROJECTION):
 
 def pieces(x, reach):
     """(n,) the number of the piece of each particle, of the pieces that particles within reach of one another form."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     pairs = cKDTree(x).query_pairs(reach, output_type="ndarray")
     joined = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(x), len(x)))
     return connected_components(joined, directed=False)[1]
@@ -67,8 +65,6 @@ def pieces(x, reach):
 def rotating_patch(across, device="cpu"):
     """A square of side 1 that turns with 1 / s for 2 s: its pieces, the radius of its corners, energy and angular
     momentum over the first, and how many spacings the particles within 0.3 of the middle are from the nearest other."""
-    from scipy.spatial import cKDTree
-
     spacing = 1.0 / across
     steps = int(np.ceil(2.0 / (0.15 * spacing / 0.7)))
     square, timed = [box([0.0, 0.0], [1.0, 1.0])], {**PROJECTION, "time_step": 2.0 / steps}
@@ -87,9 +83,8 @@ def elliptical_drop(across, dimension=2, solver=PROJECTION, device="cpu"):
     half axes over the exact ones, by second moments."""
     spacing, steps, others = 2.0 / across, 190, dimension - 1
     ball = {"shape": "sphere", "centre": [0.0] * dimension, "radius": 1.0, "phase": "water"}
-    simulation = simulated(
-        spacing, dimension, fluid=[ball], solver={**solver, "time_step": 0.0076 / steps}, device=device
-    )
+    timed = {**solver, "time_step": 0.0076 / steps}
+    simulation = simulated(spacing, dimension, fluid=[ball], solver=timed, device=device)
     x, rates = simulation.positions, np.array([-1.0] * others + [others])
     run = simulation.run(steps, {"initial_velocities": 100.0 * x * rates}, record_every=steps)
     a, c, rate, pieces_of_time = 1.0, 1.0, 100.0, 20_000

@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 import cortado
-from cortado import DivergedError, InputError, Problem, Simulation, gradients, load_scene, losses
+from cortado import DivergedError, InputError, Problem, Simulation, load_scene, losses
 from cortado.certificate import Consistency, certify
 from cortado.certificate.consistency import LossHistory, balanced, in_float64
 from cortado.certificate.horizon import Alignment, Horizon, Judged, growth
@@ -21,30 +21,22 @@ from cortado.render.renderer import scene_renderer
 from cortado.sph.free_energy import FREE_ENERGIES
 from scenes import box, jet, plane, plane_of_three, pour, scene, splash, two_layers
 
-SPLINES = {name: {"spacing": 0.05, "support": 2.6, "kernel": name} for name in ("wendland_c2", "wendland_c4")}
+C4 = {"spacing": 0.05, "support": 2.6, "kernel": "wendland_c4"}
 BY_TOLERANCE = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 2, "maximum_iterations": 30}
-BY_TOLERANCE |= {"density_tolerance": 0.001}
+NO_SLIP = box([0.0] * 3, [0.4, 0.6, 0.25], slip="no")
 PAIRWISE = {"gravity": [0.0, -9.81, 0.0], "viscosity": "pairwise"}
+
+
 RIGHT = {
     "3-D, cubic spline, splash": splash,
-    "3-D, Wendland C2": lambda: scene(discretisation=SPLINES["wendland_c2"]),
-    "3-D, Wendland C4, pairwise, no slip": lambda: scene(
-        discretisation=SPLINES["wendland_c4"], forces=PAIRWISE, container=box([0.0] * 3, [0.4, 0.6, 0.25], slip="no")
-    ),
+    "3-D, Wendland C4, pairwise, no slip": lambda: scene(discretisation=C4, forces=PAIRWISE, container=NO_SLIP),
     "3-D, without walls": lambda: scene(container={"shape": "none"}),
-    "3-D, without pressure": lambda: scene(forces={"gravity": [0.0, -9.81, 0.0], "pressure": False}),
-    "3-D, two fluids that mix": two_layers,
     "3-D, two fluids from a nozzle": pour,
-    "2-D": plane,
-    "2-D, Wendland C2, iterations by tolerance": lambda: plane(
-        discretisation=SPLINES["wendland_c2"], solver=BY_TOLERANCE
-    ),
+    "2-D, iterations by tolerance": lambda: plane(solver={**BY_TOLERANCE, "density_tolerance": 0.001}),
     "2-D, periodic, pairwise": lambda: plane(
         container=box([0.0, 0.0], [0.4, 0.8], periodic=[True, False]), forces={**PAIRWISE, "gravity": [1.0, -9.81]}
     ),
     "2-D, three fluids that mix": plane_of_three,
-    "2-D, nozzle": jet,
-    "2-D, without viscosity": lambda: plane(phase=[{"name": "water", "rest_density": 1000.0, "viscosity": 0.0}]),
 }
 
 
@@ -60,7 +52,6 @@ def test_right_gradients_are_found_right(name):
     assert found.right, (found.wrong, c.disagreement, c.miss)
     assert c.disagreement < 1e-10 and c.last_converged == 30 and c.miss < 1e-4
     assert "gravity" in found.loss_changes and found.loss_changes["time_step"] > 0.0
-    assert all(isinstance(value, (int, float, str, list, dict, type(None))) for value in found.as_dict().values())
     json.dumps(found.as_dict(), allow_nan=False)
 
 
@@ -98,31 +89,6 @@ def test_averages_are_tried_where_no_single_run_is_good(monkeypatch):
     guided = tuple(one for one in late.alignment.estimators if one.estimator != "EnsembleMean(spread)")[::2]
     advised = replace(late, alignment=replace(late.alignment, estimators=guided))
     assert "use gradients.Guided(spread) with spread = {'gravity': 0." in str(advised)
-
-
-def test_what_few_numbers_are_judged_by_is_the_best_of_estimators():
-    """Better than a mean and than guided differences, which cost more: one vector is one part, of which a guided
-    gradient has the direction."""
-    problem, sizes = problem_of(plane(), 250, centre), {"gravity": 0.5}
-    point = {"gravity": np.array([0.0, -9.81])}
-
-    def gradient(estimator):
-        return problem.estimate(point, estimator).gradient["gravity"]
-
-    truth = gradient(gradients.RandomizedSmoothing(sizes, 16, seed=1))
-    lengths = []
-    for seed in (2, 3):
-        mean = gradient(gradients.EnsembleMean(sizes, 4, seed=seed, estimator=gradients.AdjointViscosity()))
-        guided = gradient(gradients.Guided(sizes, seed=seed))
-        few = gradient(gradients.RandomizedSmoothing(sizes, 2, seed=seed))
-        assert cosine(guided, mean) == pytest.approx(1.0, abs=1e-12)
-        assert cosine(few, truth) > max(cosine(guided, truth), 0.98)
-        lengths.append([np.linalg.norm(found) / np.linalg.norm(truth) for found in (mean, guided)])
-    assert (np.diff(lengths, axis=1) > 0.1).all()
-
-
-def cosine(a, b):
-    return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
 
 def test_within_the_horizon_the_exact_gradient_is_advised():
@@ -167,17 +133,13 @@ def picture(simulation):
     return losses.Image(renderer, np.random.default_rng(1).random(renderer.shape))
 
 
-def two_frames(made):
-    return losses.Frames({3: losses.FinalPositions(0.9 * made.positions), 8: Spread()})
-
-
-SMALL_PICTURE = {"view": "top", "resolution": [12, 10]}
 IN_SINGLE = {
-    "3-D": (splash, lambda simulation: losses.FinalPositions(simulation.positions)),
-    "2-D, centre of mass": (plane, lambda simulation: losses.CentreOfMass([0.3, 0.1])),
-    "3-D, two fluids, a picture": (lambda: two_layers(render=SMALL_PICTURE), picture),
+    "3-D, two fluids, a picture": (lambda: two_layers(render={"view": "top", "resolution": [12, 10]}), picture),
     "2-D, three fluids, a loss of one's own": (plane_of_three, lambda simulation: Spread()),
-    "2-D, nozzle, two frames": (jet, two_frames),
+    "2-D, nozzle, two frames": (
+        jet,
+        lambda made: losses.Frames({3: losses.FinalPositions(0.9 * made.positions), 8: Spread()}),
+    ),
     "3-D, a function of Warp arrays": (scene, lambda simulation: recorded),
 }
 
@@ -243,13 +205,9 @@ def test_frames_are_judged_where_they_are():
     def frames(simulation):
         return losses.Frames({step: losses.FinalPositions(simulation.positions) for step in (5, 9, 12)})
 
-    problem = problem_of(plane(), 15, frames)
-    found = certify(problem)
+    found = certify(problem_of(plane(), 15, frames))
     assert found.right and found.consistency.sample_steps.tolist() == [5, 9, 12]
     assert found.consistency.losses[-1] == pytest.approx(found.loss)
-    slope = problem.tangent({"gravity": [0.0, -9.81]}, {"gravity": [0.0, 1.0]})
-    gradient = problem.value_and_gradient({"gravity": np.array([0.0, -9.81])})[1]["gravity"]
-    assert slope == pytest.approx(gradient[1])
 
 
 def test_a_scene_needs_only_a_number_of_steps():
@@ -258,9 +216,7 @@ def test_a_scene_needs_only_a_number_of_steps():
     whole = certify(problem_of(dam, 6, lambda simulation: losses.FinalPositions(simulation.positions)))
     for subject in (path, str(path), dam, Simulation(dam)):
         assert certify(subject, steps=6).as_dict() == whole.as_dict()
-    with pytest.raises(
-        InputError, match=r"^steps is left out, but must be given to certify what is no Problem but a Scene\.$"
-    ):
+    with pytest.raises(InputError, match=r"^steps is left out, but must be given to certify what is no Problem but a"):
         certify(dam)
 
 
@@ -274,7 +230,6 @@ def test_without_steps_nothing_is_claimed():
     [
         ({"parameters": ["gravitas"]}, "parameter 'gravitas' is unknown, but must be one of gravity, "),
         ({"parameters": []}, "parameters is empty, but must have at least one of gravity, "),
-        ({"parameters": ["nozzle.path"]}, "parameter 'nozzle.path' is unknown"),
         ({"parameters": {"gravity": [1.0, 2.0, 3.0]}}, r"parameter gravity has shape \(3,\), but must be"),
         ({"steps": 4}, "steps is 4, but must be left out, as the problem has 3 steps."),
         ({"perturbation": 0.0}, "perturbation is 0.0, but must be greater than 0 and less than 1."),

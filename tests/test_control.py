@@ -61,17 +61,16 @@ def test_the_known_solution_does_better_than_no_search(name):
 
 
 @tasks
-@pytest.mark.parametrize("size", ["small", "large"])
-def test_controls_are_bounded_and_large_tasks_are_long(name, size):
-    chosen = task(name, size)
+def test_controls_are_bounded_and_large_tasks_are_long(name):
+    chosen = task(name, "large")
     assert np.abs(chosen.known).max() <= 1.0 and np.abs(chosen.baseline).max() <= 0.5
     assert chosen.known.shape == (chosen.controls.numbers,)
-    assert size == "small" or (chosen.steps >= 1000 and chosen.controls.numbers >= 50)
+    assert chosen.steps >= 1000 and chosen.controls.numbers >= 50
     for parameter, value in chosen.controls.parameters(chosen.known).items():
         assert value.shape == ((chosen.steps,) if parameter == "jug.turn" else (chosen.steps, chosen.scene.dimension))
 
 
-@pytest.mark.parametrize("blocks", [10, 25, 30])
+@pytest.mark.parametrize("blocks", [10, 25])
 def test_a_tank_always_arrives_and_stands(blocks):
     chosen = replace(task("carry", "small"), blocks=blocks)
     u = np.random.default_rng(0).uniform(-1.0, 1.0, chosen.controls.numbers)
@@ -141,16 +140,11 @@ def test_a_contender_stays_within_its_budget(contender):
     contender.search(objective, seed=0)
     steps, losses = zip(*objective.curve, strict=True)
     assert max(steps) <= objective.budget and objective.best_loss == min(losses) and np.abs(objective.best).max() <= 1.0
+    if contender == Descent(gradients.Exact()):
+        assert objective.best_loss < losses[0]
     with pytest.raises(BudgetSpent):
         while True:
             objective.values([objective.start])
-
-
-def test_descent_goes_down():
-    chosen = short("splash")
-    objective = Objective(chosen, chosen.problem(), 0, budget=40.0 * chosen.steps)
-    Descent(gradients.Exact()).search(objective, 0)
-    assert objective.best_loss < objective.curve[0][1]
 
 
 @pytest.mark.parametrize("name", ["carry", "splash", "mix"])
@@ -205,9 +199,8 @@ def test_what_is_done_is_not_repeated(tmp_path, capsys):
     text = (tmp_path / "runs.jsonl").read_text()
     assert text.startswith(first) and "2 of 4 runs are in" in capsys.readouterr().out
     records = Records(tmp_path / "runs.jsonl").read()
-    assert [(one.run.contender, one.run.seed) for one in records] == [
-        (name, seed) for seed in (1, 2) for name in ("exact", "random_search")
-    ]
+    wanted = [(name, seed) for seed in (1, 2) for name in ("exact", "random_search")]
+    assert [(one.run.contender, one.run.seed) for one in records] == wanted
     assert all(one.forward_steps + BACKWARD * one.backward_steps >= one.steps[-1] for one in records)
     assert main([*command, "--seeds", "1", "2", "--figures"]) == 0
     assert {path.name for path in tmp_path.glob("*.png")} == {"carry_small.png", "carry_small_pictures.png"}

@@ -18,7 +18,7 @@ from cortado.discretise.shapes import wrapped
 from cortado.optimisation import datasets
 from cortado.optimisation.datasets import DatasetTable, Sample, one_run
 from full_disk import largest_file
-from scenes import pool_text
+from scenes import box, pool_text
 
 SCENE = pool_text([0.4, 0.4], [1.0, 1.0], 'kind = "pcisph"\ntime_step = 0.004', spacing=0.1)
 TABLE = """
@@ -73,7 +73,7 @@ def test_values_are_even_in_their_range_or_in_its_logarithm():
     assert logarithms.std() == pytest.approx(4.0 * 12**-0.5, abs=0.05)
 
 
-@pytest.mark.parametrize(("valid", "test"), [(0.1, 0.1), (0.1, 0.2), (0.0, 0.01), (0.45, 0.45), (0.0, 0.0), (0.5, 0.3)])
+@pytest.mark.parametrize(("valid", "test"), [(0.1, 0.2), (0.0, 0.01), (0.45, 0.45)])
 def test_the_purpose_of_a_run_does_not_depend_on_how_many_there_are(valid, test):
     one = table(valid=valid, test=test)
     parts = {"train": 1.0 - valid - test, "valid": valid, "test": test}
@@ -109,50 +109,16 @@ def test_tangents_are_the_derivatives_along_their_directions():
     assert not np.array_equal(found["tangent/position"][0], found["tangent/position"][1])
 
 
-def test_kinds_walls_and_statistics():
-    made, sample = simulation("float32"), Sample(table(), 0)
-    found = one_run(made, sample)
-    fluid, walls = made.particles, len(made.walls)
-    assert found.arrays["position"].shape == (4, fluid + walls, 2) and found.arrays["position"].dtype == np.float32
-    assert found.arrays["particle_type"].tolist() == [0] * fluid + [1] * walls
-    assert (np.ptp(found.arrays["position"][:, fluid:], axis=0) == 0.0).all()
-    assert one_run(made, Sample(table(walls=False), 0)).arrays["position"].shape == (4, fluid, 2)
-    found = one_run(simulation(), sample)
-    steps = np.diff(found.arrays["position"][:, :fluid], axis=0).reshape(-1, 2)
-    count, total, squares = found.statistics["vel"]
-    assert count == 3 * fluid
-    np.testing.assert_allclose(total, steps.sum(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(squares, (steps**2).sum(axis=0), rtol=1e-6)
-
-
 def test_walls_of_solids_are_where_these_are_in_every_frame():
     """Of one that turns along a path, one that falls freely, and one at rest."""
-    solids = """
-[[solid]]
-name = "paddle"
-shape = "box"
-lower = [0.55, 0.35]
-upper = [0.75, 0.65]
-motion = "path"
-times = [0.0, 0.24]
-positions = [[0.65, 0.5], [0.75, 0.55]]
-rotations = [[0.0], [0.6]]
-[[solid]]
-name = "raft"
-shape = "box"
-lower = [0.1, 0.6]
-upper = [0.3, 0.8]
-motion = "free"
-density = 500.0
-[[solid]]
-name = "post"
-shape = "box"
-lower = [0.8, 0.0]
-upper = [1.0, 0.2]
-"""
-    words = SCENE.replace('"pcisph"', '"projection"') + solids
-    made = Simulation(cortado.Scene(**loads(words)), precision="float64")
-    found = one_run(made, Sample(table(), 0)).arrays
+    path = {"motion": "path", "times": [0.0, 0.24], "positions": [[0.65, 0.5], [0.75, 0.55]]}
+    solids = [
+        box([0.55, 0.35], [0.75, 0.65], name="paddle", rotations=[[0.0], [0.6]], **path),
+        box([0.1, 0.6], [0.3, 0.8], name="raft", motion="free", density=500.0),
+        box([0.8, 0.0], [1.0, 0.2], name="post"),
+    ]
+    scene = cortado.Scene(**loads(SCENE.replace('"pcisph"', '"projection"')), solid=solids)
+    found = one_run(Simulation(scene, precision="float64"), Sample(table(), 0)).arrays
     kinds, places = found["particle_type"], found["position"]
     assert {1, 2, 3} <= set(kinds.tolist())
     for kind, name in ((2, "paddle"), (3, "raft")):
@@ -176,6 +142,8 @@ def test_positions_have_bounds_from_zero_on():
     made = simulation()
     walls = one_run(made, Sample(table(), 0)).arrays["position"][0, made.particles :]
     assert walls.min() > 0.0 and (walls.max(axis=0) < size).all()
+    alone = one_run(made, Sample(table(walls=False), 0)).arrays["position"]
+    assert alone.shape == (4, made.particles, 2) and len(walls) == len(made.walls)
     with pytest.raises(InputError, match=r"Particle 1 is 0.2 m below the bounds .* along axis 0 in frame 0"):
         datasets._statistics(np.zeros((1, 2, 2)), np.array([[[0.1, 0.1], [-0.2, 0.1]]]), periods)
     found = datasets._statistics(np.zeros((1, 2, 2)), np.array([[[0.1, 2.0], [0.2, 0.1]]]), periods)
@@ -280,18 +248,6 @@ def test_runs_that_fail_are_left_out_and_said(file, cortado_command, quick):
     assert code == 1 and "None of the runs for train could be computed. The first: no fluid fits." in err
 
 
-def test_what_was_killed_goes_on(file, cortado_command, quick):
-    quick.others[3] = KeyboardInterrupt()
-    code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "data")
-    assert code == 130 and "Interrupted; 3 of 5 runs are finished, in" in err
-    assert "the same command goes on with the rest." in err
-    quick.others.clear()
-    quick.asked.clear()
-    code, _, err = cortado_command("dataset", file, "--runs", 5, "--out", "data")
-    assert code == 0 and quick.asked == [3, 4], err
-    assert [arrays_of(f"data/{name}.h5")["00000/position"][0, 0, 0] for name in ("train", "valid", "test")] == [0, 1, 2]
-
-
 @pytest.mark.parametrize(("size", "there"), [(15_000, 0), (50_000, 5), (None, 5)])
 def test_a_full_disk_is_a_sentence_and_keeps_what_is_there(size, there, file, cortado_command, quick, monkeypatch):
     """Full at the first run, in the midst of the file of all of them, and before it."""
@@ -317,10 +273,7 @@ def varied(key, lower, upper, more=("dataset.logarithmic=[]",)):
         (("--runs", 2), "--runs is 2, but must be from 3 to 100,000: one to train and one to validate"),
         (("--set", "dataset.write_every=4"), "dataset.write_every is 4, but must be a divisor of steps, which is 6"),
         (varied("solver.time_step", 0.001, 0.002), "vary has solver.time_step, which must be the same"),
-        (
-            varied("picture.film_speed", 0.1, 0.2),
-            "vary has picture.film_speed, which has no effect on what is computed",
-        ),
+        (varied("picture.film_speed", 0.1, 0.2), "vary has picture.film_speed, which has no effect on what is com"),
         (("--set", "problem.steps=3"), "problem.steps is given, but must be left out"),
         (varied("phase.oil.viscosity", 0.1, 0.2), "oil"),
         (varied("phase.0.viscosity", 0.2, 0.1, ()), "dataset.vary.'phase.0.viscosity' is [0.2, 0.1], but must"),
@@ -389,10 +342,8 @@ def test_a_data_set_that_grows_is_the_one_made_at_once_and_keeps_its_runs(file, 
     assert code == 0 and asked == list(range(5, 11)), err
     assert "its first 5 runs are as they were" in out and "failed" not in err
     after = content_of("grown")
-    assert_same(
-        {name: one for name, one in before.items() if name != "metadata"},
-        {name: after[name] for name in before if name != "metadata"},
-    )
+    runs = [name for name in before if name != "metadata"]
+    assert_same({name: before[name] for name in runs}, {name: after[name] for name in runs})
     assert cortado_command(*again, "--runs", 11, "--out", "once")[0] == 0
     assert_same(content_of("once"), after)
     assert after["metadata"]["runs"] == 11 and list(after["metadata"]["failed"]) == ["3"]
@@ -404,25 +355,37 @@ def grown(cortado_command, file, runs=11):
     return cortado_command("dataset", file, "--runs", runs, "--out", "data")
 
 
-@pytest.mark.parametrize("where", ["in a run", "as the files are put together", "between two files"])
-def test_growing_that_was_killed_goes_on(where, file, cortado_command, quick, monkeypatch):
+STOPS = {
+    "in a run": None,
+    "as the files are put together": (h5py.File, "copy", KeyboardInterrupt),
+    "between two files": (Path, "replace", KeyboardInterrupt),
+    "on a full disk": (h5py.File, "copy", RuntimeError),
+}
+
+
+@pytest.mark.parametrize("where", STOPS)
+def test_growing_that_was_stopped_goes_on(where, file, cortado_command, quick, monkeypatch):
     assert grown(cortado_command, file, 5)[0] == 0
+    before = content_of("data")
     with monkeypatch.context() as patch:
         if where == "in a run":
             quick.others[7] = KeyboardInterrupt()
         else:
-            owner, name = (Path, "replace") if where == "between two files" else (h5py.File, "copy")
+            owner, name, error = STOPS[where]
             calls, whole = [], getattr(owner, name)
 
             def stop(*given):
                 calls.append(given)
                 if len(calls) == 2:
-                    raise KeyboardInterrupt
+                    raise error("no space")
                 return whole(*given)
 
             patch.setattr(owner, name, stop)
         code, _, err = grown(cortado_command, file)
-    assert code == 130 and f"{7 if where == 'in a run' else 11} of 11 runs are finished" in err
+    told = ("free some space", 1) if "disk" in where else ("Interrupted; ", 130)
+    assert told[0] in err and told[1] == code and f"{7 if where == 'in a run' else 11} of 11 runs are finished" in err
+    if where != "between two files":
+        assert_same(content_of("data"), before)
     quick.others.clear()
     quick.asked.clear()
     code, _, err = grown(cortado_command, file)
@@ -433,7 +396,7 @@ def test_growing_that_was_killed_goes_on(where, file, cortado_command, quick, mo
     assert not [one for one in Path("data").iterdir() if one.suffix == ".tmp" or one.name == "runs"]
 
 
-@pytest.mark.parametrize("harm", ["cut", "gone", "empty", "metadata", "part"])
+@pytest.mark.parametrize("harm", ["cut", "gone", "metadata", "part"])
 def test_a_half_written_file_is_told_and_mended(harm, file, cortado_command, quick, monkeypatch):
     assert grown(cortado_command, file, 5)[0] == 0
     before = content_of("data")
@@ -446,7 +409,7 @@ def test_a_half_written_file_is_told_and_mended(harm, file, cortado_command, qui
     if harm == "metadata":
         path = Path("data/metadata.json")
     content = path.read_bytes()
-    path.unlink() if harm == "gone" else path.write_bytes(b"" if harm == "empty" else content[: len(content) // 2])
+    path.unlink() if harm == "gone" else path.write_bytes(content[: len(content) // 2])
     quick.asked.clear()
     code, _, err = grown(cortado_command, file, 11 if harm == "part" else 5)
     assert code == 0
@@ -456,30 +419,6 @@ def test_a_half_written_file_is_told_and_mended(harm, file, cortado_command, qui
     if harm != "part":
         assert_same(content_of("data"), before)
     assert "is complete already" in grown(cortado_command, file, 11 if harm == "part" else 5)[1]
-
-
-@pytest.mark.parametrize("second", [False, True])
-def test_a_disk_that_fills_as_a_data_set_grows_leaves_it_as_it_was(second, file, cortado_command, quick, monkeypatch):
-    """As the first file is written, or the second, when the first one is whole."""
-    assert grown(cortado_command, file, 5)[0] == 0
-    before, copies, whole = content_of("data"), [], h5py.File.copy
-    first = len(command._table(file, []).split(11)["train"])
-
-    def refusing(*given):
-        copies.append(given)
-        if len(copies) > first:
-            raise RuntimeError("no space")
-        return whole(*given)
-
-    with monkeypatch.context() as patch:
-        if second:
-            patch.setattr(h5py.File, "copy", refusing)
-        with nullcontext() if second else largest_file(Path("data/train.h5").stat().st_size + 1000):
-            code, _, err = grown(cortado_command, file)
-    assert code == 1 and "free some space" in err and "11 of 11 runs are finished" in err
-    assert_same(content_of("data"), before)
-    quick.asked.clear()
-    assert grown(cortado_command, file)[0] == 0 and not quick.asked
 
 
 def test_a_file_of_the_scene_with_another_content_is_another_scene(tmp_path, monkeypatch, cortado_command, quick):
@@ -529,7 +468,6 @@ def test_lagrangebench_reads_a_data_set_that_has_grown(periodic, file, cortado_c
         ({"logarithmic": ("viscosity",)}, "logarithmic"),
         ({"vary": {"a": [-1.0, 1.0]}, "logarithmic": ("a",)}, "vary.a"),
         ({"vary": {"a": [0.0, np.nan]}}, "vary.a"),
-        ({"vary": {"a": [0.0, [1.0, 2.0]]}}, "vary.a"),
         ({"vary": {"a": {"b": [0.0, 1.0]}}}, "vary.a"),
         ({"valid": 0.6, "test": 0.5}, "test"),
         ({"steps": 0}, "steps"),

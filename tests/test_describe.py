@@ -18,7 +18,6 @@ from cortado.optimisation.task_files import load_task, task_in_words
 from cortado.pictures.image_files import read_picture
 from cortado.pictures.plane import PlanePainter
 from cortado.runs.recording import EverySteps, FramesPerSecond
-from cortado.scene.stability import stability_limits
 from scenes import box, jet, plane, pool, stability_limit, two_layers
 
 
@@ -68,10 +67,9 @@ def test_another_mass_than_was_asked_for_is_told(capsys):
 
 def test_a_cubic_metre_of_water_is_a_tonne():
     """With every kernel and support."""
+    cubes = [f"{one}.{end}" for one in ("fluid.0", "container") for end in ("upper=[1,1]", "lower=[0,0]")]
     for kernel in KERNELS:
         for support in (1.2, 3.0):
-            ends = ("upper=[1,1]", "lower=[0,0]")
-            cubes = [f"{one}.{end}" for one in ("fluid.0", "container") for end in ends]
             cut = ["discretisation.spacing=0.2", f"discretisation.kernel={kernel}", f"discretisation.support={support}"]
             found = cortado.Simulation(cortado.load_scene("scene.toml", [*cubes, *cut])).masses
             assert sum(found.given.values()) == pytest.approx(1000.0, rel=1e-6)
@@ -80,8 +78,8 @@ def test_a_cubic_metre_of_water_is_a_tonne():
 @pytest.mark.parametrize(
     "time, steps, choice",
     [
-        *((time, None, FramesPerSecond(rate)) for time, rate in ((0.05, 100.0), (0.049, 100.0), (0.05, 5000.0))),
-        *((None, steps, EverySteps(3)) for steps in (20, 21)),
+        *((time, None, FramesPerSecond(rate)) for time, rate in ((0.049, 100.0), (0.05, 5000.0))),
+        (None, 20, EverySteps(3)),
     ],
 )
 def test_a_run_has_the_steps_and_the_frames_that_were_told(time, steps, choice):
@@ -133,6 +131,8 @@ def test_phases_and_an_emitter_are_told(capsys):
     found = described(capsys, "latte.toml")
     each = found["particles_of_phase"].values()
     assert sum(each) == found["particles"] and min(each) > 0
+    course = "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"
+    assert "gravity changes until 0.2 s, and is constant from then on" in told(capsys, "scene.toml", "--set", course)
     out = told(capsys, "latte.toml", "--steps", "20")
     assert "as a quick look, about" in out and "to draw with its light traced, 0.2 s and 0.5 s for the first" in out
     assert "milk" in out and "in 3-D" in out and "limits: " in out and "ms a step on cpu in float32" in out
@@ -157,12 +157,6 @@ def test_an_opening_that_is_no_whole_number_of_cells_is_told(capsys):
     assert "at 1.2 m/s, through 0.1 m of cells, where an opening of 0.115 m was asked for" in told
 
 
-def test_a_schedule_is_told(capsys):
-    course = "schedule.gravity={times=[0,0.2],values=[[0,-9.81],[3,-9]]}"
-    out = told(capsys, "scene.toml", "--set", course)
-    assert "gravity changes until 0.2 s, and is constant from then on" in out
-
-
 @pytest.mark.usefixtures("rendered")
 def test_the_first_state_is_drawn(capsys):
     found = described(capsys, "scene.toml", "--picture", "a/first.png")
@@ -182,14 +176,10 @@ def test_a_scene_that_does_not_bear_its_first_steps(capsys, monkeypatch):
     ("line", "words"),
     [
         ("absent.toml", "cannot be read"),
-        (".", "cannot be read"),
         ("scene.toml --steps 0", "steps is 0"),
         ("scene.toml --steps 5 --time 1", "--time is given, but must be left out"),
-        ("scene.toml --time nan", "--time is nan"),
         ("scene.toml --time 1e30", "must be less, as that takes about"),
         ("scene.toml --fps -1", "--fps is -1"),
-        ("scene.toml --record-every 0", "--record-every is 0"),
-        ("scene.toml --device tpu", "device is 'tpu'"),
         ("scene.toml --picture scene.toml/a.png", "cannot be written"),
         ("scene.toml --picture .", "--picture is '.', but must be the name of a PNG file"),
     ],
@@ -198,11 +188,6 @@ def test_mistakes_are_sentences(cortado_command, line, words):
     code, out, err = cortado_command("describe", *line.split())
     assert_one_sentence(err.splitlines()[-1])
     assert (code, out) == (2, "") and words in err
-
-
-def test_every_limit_is_one_of_those_of_the_time_step():
-    scene = plane(forces={"gravity": [0.0, -9.81], "surface_tension": 0.07})
-    assert stability_limits(scene).keys() == {"speed", "gravity", "viscosity", "surface tension", "depth"}
 
 
 # ---- the closing line --------------------------------------------------------------------------------------------
@@ -220,6 +205,9 @@ def test_energies_are_those_of_the_particles(make):
     assert summary.first.potential == pytest.approx((masses * height).sum(), rel=1e-12)
     assert summary.milliseconds == pytest.approx(100.0)
     assert f"energy {summary.last.total:.4g} J" in str(summary)
+    still = cortado.Simulation(plane(forces={"gravity": [0, 0]}, container={"shape": "none"}))
+    rollout = still.rollout(1)
+    assert Energy.of(still, rollout, rollout.initial, 0).total == 0.0
 
 
 LIGHT = {"name": "water", "rest_density": 800.0, "viscosity": 0.1}
@@ -233,9 +221,8 @@ def test_densities_are_those_of_the_rest_lattice():
     simulation = cortado.Simulation(scene, precision="float64")
     rollout = simulation.rollout(2)
     last = rollout.forward(keep=False)
-    assert RunSummary(simulation, rollout, last, 1.0, {}).densities == pytest.approx(
-        [800.0 * (1.0 - SLACK)] * 2, rel=1e-9
-    )
+    found = RunSummary(simulation, rollout, last, 1.0, {}).densities
+    assert found == pytest.approx([800.0 * (1.0 - SLACK)] * 2, rel=1e-9)
     at = last.numpy(2)["positions"]
     at[7] += 0.02
     last.set({"positions": at})
@@ -278,53 +265,30 @@ def test_a_run_ends_with_them(capsys):
     assert "time that a step took" in Path("runs/run/report.html").read_text()
 
 
+CUP = """
+dimension = 3
+discretisation = {spacing = 0.01}
+phase = [{name = "coffee", rest_density = 1000.0, viscosity = 0.1}]
+fluid = [{shape = "box", lower = [-0.015, 0.0, -0.015], upper = [0.015, 0.02, 0.015], phase = "coffee"}]
+container = {shape = "cylinder", base = [0.0, 0.0, 0.0], radius = 0.03, height = 0.02, lid = false}
+solver = {kind = "pcisph", time_step = 0.004}
+"""
+OVER = ["--set", "forces.gravity=[0,9.81,0]", "--set", "fluid.0.velocity=[0.5,1,0]"]
+
+
 def test_what_went_over_the_rim_is_counted(folder, capsys):
     """Where gravity points out of the cup, all of it."""
-    (folder / "cup.toml").write_text(
-        """
-        dimension = 3
-        [discretisation]
-        spacing = 0.01
-        [[phase]]
-        name = "coffee"
-        rest_density = 1000.0
-        viscosity = 0.1
-        [[fluid]]
-        shape = "box"
-        lower = [-0.015, 0.0, -0.015]
-        upper = [0.015, 0.02, 0.015]
-        phase = "coffee"
-        velocity = [0.5, 1.0, 0.0]
-        [container]
-        shape = "cylinder"
-        base = [0.0, 0.0, 0.0]
-        radius = 0.03
-        height = 0.02
-        lid = false
-        [forces]
-        gravity = [0.0, 9.81, 0.0]
-        [solver]
-        kind = "pcisph"
-        time_step = 0.004
-        """
-    )
+    (folder / "cup.toml").write_text(CUP)
     words = ["run", "cup.toml", "--steps", "40", "--no-pictures"]
-    main([*words, "--out", "spilt"])
+    main([*words, "--out", "spilt", *OVER])
     assert "Over the rim of the cup went 18 of 18 particles." in capsys.readouterr().out
     assert json.loads(Path("spilt/result.json").read_text())["spilt"] == 18
     assert "left the cup over its rim" in Path("spilt/report.html").read_text()
-    main([*words, "--out", "held", "--set", "forces.gravity=[0,-9.81,0]", "--set", "fluid.0.velocity=[0,0,0]"])
+    main([*words, "--out", "held"])
     assert "Over the rim" not in capsys.readouterr().out
-    main(["describe", "cup.toml"])
+    main(["describe", "cup.toml", *OVER])
     size = "fluid in 0.03 x 0.02 x 0.03 m, in a container of 0.06 x 0.02 x 0.06 m; 0.018 kg of coffee"
     assert f"{size}; gravity (0, 9.81, 0) m/s2" in capsys.readouterr().out
-
-
-def test_potential_energy_without_gravity_or_container():
-    scene = plane(forces={"gravity": [0, 0]}, container={"shape": "none"})
-    simulation = cortado.Simulation(scene)
-    rollout = simulation.rollout(1)
-    assert Energy.of(simulation, rollout, rollout.initial, 0).total == 0.0
 
 
 def test_a_task_is_told_in_words(capsys):

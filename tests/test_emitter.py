@@ -27,12 +27,11 @@ def problem_of(name):
     return Problem(simulation, STEPS, Weighed(simulation))
 
 
-def point_of(problem, over_time=True):
+def point_of(problem):
     simulation, random = problem.simulation, np.random.default_rng(3)
     own = simulation.parameters()
-    path, time = own["nozzle.path"] + 0.003, np.arange(STEPS)[:, None] / STEPS
-    if over_time:  # from its place at rest
-        path = own["nozzle.path"] + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(own["nozzle.path"])))
+    time = np.arange(STEPS)[:, None] / STEPS  # from its place at rest
+    path = own["nozzle.path"] + 0.02 * np.sin(time * np.arange(2.0, 2.0 + len(own["nozzle.path"])))
     x = own["initial_positions"]
     own |= {"nozzle.path": path, "initial_positions": x + 0.001 * random.standard_normal(x.shape)}
     own["initial_velocities"] = own["initial_velocities"] + 0.1 * random.standard_normal(x.shape)
@@ -53,36 +52,19 @@ def released(problem, point, frames):
 
 
 @scenes
-def test_some_particles_are_let_go_none_near_a_step(name):
-    """What the tests below stand on: none is let go earlier or later over the steps of their differences."""
+@pytest.mark.parametrize("key", ["nozzle.path", "all"])
+def test_gradient_equals_tangent_and_differences(name, key):
+    """Of a path that has a row for each step; a place at rest is in tests/test_features.py. Some particles are let go,
+    and none earlier or later over the steps of differences."""
     problem = problem_of(name)
     point = point_of(problem)
     left = released(problem, point, np.arange(STEPS + 1)[:, None])
-    speed = -np.diff(left[:, 0])[0]
     assert (left[-1] < 0.0).sum() >= 4 and (left[-1] > 0.0).sum() >= 4
-    assert np.abs(left).min() > 1e-2 * speed
-
-
-@scenes
-@pytest.mark.parametrize("key", ["nozzle.path", "all"])
-def test_gradient_equals_tangent_and_differences(name, key):
-    """Of a path that has a row for each step; a place at rest is in tests/test_features.py."""
-    problem = problem_of(name)
-    point = point_of(problem)
+    assert np.abs(left).min() > 1e-2 * -np.diff(left[:, 0])[0]
     directions = {k: direction_of(k, value) for k, value in point.items() if key in ("all", k)}
     gradient, tangent = both_modes(problem, point, directions)
     assert all(gradient[k].shape == value.shape for k, value in point.items())
     assert distance(problem.value, point, directions, tangent, decades(2.0, 7.0), enough=1e-7) < 1e-6
-
-
-@scenes
-def test_a_place_at_rest_has_the_gradient_of_a_path_summed_up(name):
-    problem = problem_of(name)
-    point = point_of(problem, over_time=False)
-    rows = {**point, "nozzle.path": np.tile(point["nozzle.path"], (STEPS, 1))}
-    (loss, whole), (same, parts) = problem.value_and_gradient(point), problem.value_and_gradient(rows)
-    assert loss == same and np.ptp(parts["nozzle.path"], axis=0).max() > 0.0
-    np.testing.assert_allclose(parts["nozzle.path"].sum(axis=0), whole["nozzle.path"], rtol=1e-9)
 
 
 @scenes
@@ -117,9 +99,8 @@ def test_particles_are_let_go_without_a_jump(name):
     seen = 0
     for n in range(1, STEPS + 1):
         free = (released(problem, point, n - 1) > 0.0) & (released(problem, point, n) <= 0.0)
-        (x_before, x), (v_before, v) = (
-            frames[n - 1 : n + 1, first:][:, free] for frames in (trajectory.positions, trajectory.velocities)
-        )
+        x_before, x = trajectory.positions[n - 1 : n + 1, first:][:, free]
+        v_before, v = trajectory.velocities[n - 1 : n + 1, first:][:, free]
         np.testing.assert_allclose(x - x_before, dt * v, rtol=0, atol=1e-14)
         assert np.linalg.norm(v - v_before, axis=1).max(initial=0.0) < 0.05 * np.linalg.norm(v, axis=1).max(initial=1.0)
         seen += free.sum()
@@ -140,10 +121,9 @@ def test_without_forces_the_column_goes_straight_on(direction):
     unit = np.array(direction) / np.linalg.norm(direction)
     travelled = sample.speed * trajectory.times[:, None, None] * unit
     assert sample.speed * trajectory.times[-1] > 0.075
-    np.testing.assert_allclose(
-        trajectory.positions[:, emitter.first :], sample.positions + travelled, rtol=0, atol=1e-13
-    )
-    np.testing.assert_allclose(trajectory.velocities[:, emitter.first :] - sample.speed * unit, 0.0, rtol=0, atol=1e-12)
+    x, v = trajectory.positions[:, emitter.first :], trajectory.velocities[:, emitter.first :]
+    np.testing.assert_allclose(x, sample.positions + travelled, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(v - sample.speed * unit, 0.0, rtol=0, atol=1e-12)
 
 
 def supplied(**emitter):
@@ -157,9 +137,7 @@ def test_a_reserve_joins_the_column_for_as_long_as_the_run_goes():
     assert made.lasting(2.0) is made and dry.lasting(0.15) is dry
     sample, spacing = made.emitter[0].sample(0.05), 0.05
     came = made.emitter[0].flow_rate * time / spacing**2
-    with pytest.warns(
-        CortadoWarning, match=r"nozzle runs dry at 0.15 s of a run to 0.252 s, .*: scene.lasting\(0.252\)"
-    ):
+    with pytest.warns(CortadoWarning, match=r"nozzle runs dry at 0.15 s of a run to 0.252 s, .*: scene.lasting\(0.252"):
         Simulation(dry, precision="float64").run(time=time)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -198,9 +176,6 @@ def test_a_run_goes_on_with_the_reserve_of_the_run_before():
 
 MISTAKES = {
     "parameter nozzle.path has shape (3,), but must be (2,) or (30, 2) in m": {"nozzle.path": [0.1, 0.2, 0.3]},
-    "parameter nozzle.path has shape (4, 2), but must be": {"nozzle.path": np.zeros((4, 2))},
-    "parameter nozzle.path has a value that is not finite": {"nozzle.path": [np.nan, 0.2]},
-    "parameter nozzle.flow_rate has shape (1,), but must be () or (30,)": {"nozzle.flow_rate": [0.1]},
     "parameter nozzle.flow_rate is -0.1, but must be at least 0": {"nozzle.flow_rate": -0.1},
 }
 
@@ -212,9 +187,7 @@ def test_a_mistake_is_a_sentence(words):
     assert str(caught.value).startswith(words)
 
 
-@pytest.mark.parametrize(
-    "value", [{"nozzle.path": [0.1, 0.2]}, {"nozzle.flow_rate": 0.1}], ids=lambda value: next(iter(value))
-)
+@pytest.mark.parametrize("value", [{"nozzle.path": [0.1, 0.2]}, {"nozzle.flow_rate": 0.1}])
 def test_without_an_emitter_its_parameters_are_a_sentence(value):
     simulation = Simulation(plane(), precision="float64")
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))

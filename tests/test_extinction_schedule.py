@@ -67,18 +67,13 @@ def test_a_hidden_run_is_seen_through_the_same_fluid(tmp_path):
         assert search.problem.value(made.task.true_parameters) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    "schedule", ["[]", "[0.5]", "[1.0, 1.0]", "[0.5, 0.25, 1.0]", "[0.0, 1.0]", '["a", 1.0]', "1.0"]
-)
-def test_the_schedule_grows_to_one(file, schedule):
-    with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*the last of them 1"):
-        load_task(file, [f"optimise.extinction_schedule={schedule}"])
-
-
-def test_positions_have_no_extinction(tmp_path):
-    (tmp_path / "task.toml").write_text(GOOD_TASK)
+def test_the_schedule_grows_to_one(file):
+    for schedule in ("[]", "[0.5]", "[1.0, 1.0]", "[0.5, 0.25, 1.0]", "[0.0, 1.0]", '["a", 1.0]', "1.0"):
+        with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*the last of them 1"):
+            load_task(file, [f"optimise.extinction_schedule={schedule}"])
+    file.write_text(GOOD_TASK)
     with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*left out, as positions are compared"):
-        load_task(tmp_path / "task.toml", [STAGED])
+        load_task(file, [STAGED])
 
 
 def test_each_search_begins_where_the_last_one_ended(file):

@@ -63,26 +63,19 @@ def test_a_device_a_pipe_or_a_link_under_a_name_that_can_be_guessed_is_not_repla
     assert len({unfinished(tmp_path / "a") for _ in range(100)}) == 100
 
 
-def a_socket(path):
-    with socket.socket(socket.AF_UNIX) as made:
-        made.bind(str(path))
-
-
-def a_large_file(path):
-    path.write_bytes(b"")
-    os.truncate(path, 3_400_000)
-
-
 @pytest.mark.parametrize(
     "make, words",
     [
         (lambda path: path.mkdir(), "it is a directory, but must be a regular file"),
         (os.mkfifo, "it is a pipe, but must be a regular file"),
-        (a_socket, "it is a socket, but must be a regular file"),
+        (lambda path: socket.socket(socket.AF_UNIX).bind(str(path)), "it is a socket, but must be a regular file"),
         (lambda path: path.symlink_to("/dev/zero"), "it is a device, but must be a regular file"),
         (lambda path: path.symlink_to(path), "symbolic links"),
         (lambda path: None, "No such file"),
-        (a_large_file, "it has 3,400,000 bytes, but must have at most 1,000,000"),
+        (
+            lambda path: (path.touch(), os.truncate(path, 3_400_000)),
+            "it has 3,400,000 bytes, but must have at most 1,000",
+        ),
     ],
 )
 def test_what_is_not_read(tmp_path, monkeypatch, make, words):

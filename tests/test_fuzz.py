@@ -21,7 +21,6 @@ from fuzz.campaign import Campaign
 from fuzz.cases import Case, Family
 from fuzz.environments import ENVIRONMENTS, shell_script
 from fuzz.hostile import make_hostile
-from fuzz.ledger import Entry, Ledger
 from fuzz.mutations import mutate
 from fuzz.processes import Kill, Limits, call
 from fuzz.text_mutations import mutate_text, option, override
@@ -68,12 +67,10 @@ def test_a_good_end_is_not_complained_of(tmp_path, program):
         (fail, "Traceback"),
         (partial(say, 3, "Something."), "exit code 3"),
         (partial(say, 2, "One line.", "Another."), "2 lines on stderr"),
-        (partial(say, 2), "0 lines on stderr"),
         (partial(say, 0, "Oh."), "all is well, but"),
         (partial(say, 2, "A \x1b[31m name."), "control character"),
         (partial(say, 2, "a" * 2000), "characters on stderr"),
         (lambda: os.kill(os.getpid(), signal.SIGSEGV), "SIGSEGV"),
-        (lambda: os.abort(), "SIGABRT"),
     ],
 )
 def test_a_bad_end_is_complained_of(tmp_path, program, words):
@@ -83,6 +80,8 @@ def test_a_bad_end_is_complained_of(tmp_path, program, words):
 def test_a_hang_is_found_with_its_place(tmp_path):
     found = judged(tmp_path, wait_long, Limits(seconds=0.3))
     assert len(found) == 1 and found[0].startswith("hung for more than 0.3 s in wait_long")
+    outcome = call(wait_long, ("test",), tmp_path, kill=Kill(0.05, signal.SIGTERM))
+    assert outcome.code == -signal.SIGTERM and outcome.seconds < 5.0
 
 
 def test_work_that_says_that_it_takes_long_is_no_hang(tmp_path):
@@ -100,13 +99,8 @@ def test_much_memory_is_found_and_not_that_of_this_process(tmp_path):
     assert judged(tmp_path, lambda: None, Limits(memory=usual + 100_000_000)) == []
     found = judged(tmp_path, partial(hold, 300_000_000), Limits(memory=usual + 100_000_000))
     assert len(found) == 1 and "held" in found[0]
-    held = np.ones(1_000_000_000, dtype=np.uint8)
+    held = np.ones(400_000_000, dtype=np.uint8)
     assert call(lambda: None, ("test",), tmp_path).memory < 300_000_000 < len(held)
-
-
-def test_a_kill_is_a_kill(tmp_path):
-    outcome = call(wait_long, ("test",), tmp_path, kill=Kill(0.05, signal.SIGTERM))
-    assert outcome.code == -signal.SIGTERM and outcome.seconds < 5.0
 
 
 def trajectory_of(positions, at=0.3):
@@ -155,12 +149,12 @@ def test_a_folder_without_what_was_asked_for_is_found(tmp_path):
     assert answers.leftovers(tmp_path) == [".scene.json.3.tmp"]
 
 
-@pytest.mark.parametrize("name", bases.scenes())
-def test_the_bases_are_good(tmp_path, name):
-    scene = scene_from_dict(bases.scenes()[name])
-    assert sum(fluid.count(scene.discretisation.spacing) for fluid in scene.fluid) < 1500
-    if name in bases.tasks():
-        (tmp_path / "task.toml").write_text(to_toml(bases.tasks()[name]))
+def test_the_bases_are_good(tmp_path):
+    for tables in bases.scenes().values():
+        scene = scene_from_dict(tables)
+        assert sum(fluid.count(scene.discretisation.spacing) for fluid in scene.fluid) < 1500
+    for tables in bases.tasks().values():
+        (tmp_path / "task.toml").write_text(to_toml(tables))
         load_task(tmp_path / "task.toml")
 
 
@@ -173,7 +167,7 @@ def drawn(seed, number):
     return words, text, override(case.random), option(case.random)
 
 
-def test_a_case_repeats_from_its_seed_and_odd_values_can_be_written_and_read():
+def test_a_case_repeats_from_its_seed_and_odd_values_and_hostile_files_are_made(tmp_path):
     assert all(drawn(1, number) == drawn(1, number) for number in range(40))
     assert drawn(1, 3) != drawn(1, 4) and drawn(1, 3) != drawn(2, 3)
     random = np.random.default_rng(0)
@@ -181,36 +175,20 @@ def test_a_case_repeats_from_its_seed_and_odd_values_can_be_written_and_read():
         to_toml({"x": oddities.value(random)})
     for tables in bases.tasks().values():
         assert tomllib.loads(to_toml(tables)) == tables
-    odd = {'a "b"': [1, -2.5, "水\n\x7f", True, {"c d": []}], "inf": float("inf")}
-    assert tomllib.loads(to_toml(odd)) == odd
-
-
-def test_hostile_files_are_made(tmp_path):
-    good, random = tmp_path / "good.npy", np.random.default_rng(0)
+    good, made, random = tmp_path / "good.npy", set(), np.random.default_rng(0)
     np.save(good, np.zeros((64, 2)))
-    made = set()
     for number in range(150):
         path = tmp_path / str(number) / "points.npy"
         path.parent.mkdir()
         made.add(make_hostile(path, good.read_bytes(), [b"others"], random))
     assert {"a shape beyond the file", "a pipe", "endless zeros", "cut", "of another format"} <= made
+    odd = {'a "b"': [1, -2.5, "水\n\x7f", True, {"c d": []}], "inf": float("inf")}
+    assert tomllib.loads(to_toml(odd)) == odd
 
 
-@pytest.mark.parametrize("environment", ENVIRONMENTS, ids=lambda environment: environment.name)
-def test_scripts_are_right(environment):
-    subprocess.run(["bash", "-n", "-c", shell_script(environment, "run", Path("kernels"))], check=True)
-
-
-def test_a_ledger_remembers(tmp_path):
-    path = tmp_path / "ledger.jsonl"
-    ledger = Ledger(path)
-    ledger.add(Entry("a:1", [], [], [0], 0.1, 0.1, 5))
-    ledger.add(Entry("a:2", ["bad"], [], [1], 0.1, 0.1, 5))
-    path.write_bytes(path.read_bytes() + b'{"case": "a:3", "compl')  # torn by a kill
-    again = Ledger(path)
-    assert list(again.entries) == ["a:1", "a:2"] and [entry.case for entry in again.failed()] == ["a:2"]
-    again.add(Entry("a:2", [], [], [0], 0.1, 0.1, 5))
-    assert list(Ledger(path).entries) == ["a:1", "a:2"] and not Ledger(path).failed()
+def test_scripts_are_right():
+    scripts = (shell_script(environment, "run", Path("kernels")) for environment in ENVIRONMENTS)
+    subprocess.run(["bash", "-n", "-c", "\n".join(f"(\n{script}\n)" for script in scripts)], check=True)
 
 
 def toy(case):
@@ -238,6 +216,8 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, capfd):
     assert "python -m fuzz --seed 5 --again toy:2" in capfd.readouterr().out
     calls = (tmp_path / "calls").read_text().splitlines()
     assert sorted(line.split()[0] for line in calls) == [f"toy:{number}" for number in range(6)]
+    with open(tmp_path / "seed-5" / "ledger.jsonl", "ab") as file:
+        file.write(b'{"case": "toy:9", "compl')  # torn by a kill
     third = campaign()
     third.run(["toy:1"])
     assert (tmp_path / "calls").read_text().splitlines()[-1] in calls  # the same random numbers

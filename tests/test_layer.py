@@ -206,16 +206,12 @@ def test_a_map_is_a_batch_with_the_bits_of_single_evaluations(lib, simulation, p
         assert np.abs(wanted).max() > 0.0
         for mapped in (lib.vmap(function), lib.compiled(lib.vmap(function))):
             assert np.asarray(mapped(gravities)).tobytes() == wanted.tobytes()
+    estimator = gradients.RandomizedSmoothing(samples=4)  # without batches: one by one
+    alone = lib.vmap(lib.grad(lambda m: lib.layer.value(problem, estimator)({"viscosity": m})))(lib.array([10.0, 12.0]))
+    wanted = [problem.value_and_gradient({"viscosity": m}, estimator)[1]["viscosity"] for m in (10.0, 12.0)]
+    np.testing.assert_array_equal(alone, wanted)
     summed = lib.grad(lambda g: lib.vmap(loss)(g).sum())(gravities)
     np.testing.assert_array_equal(summed, lib.vmap(lib.grad(loss))(gravities))
-
-
-def test_an_estimator_without_batches_is_mapped_one_by_one(lib, problem):
-    estimator, viscosities = gradients.RandomizedSmoothing(samples=4), [10.0, 12.0]
-    loss = lib.layer.value(problem, estimator)
-    found = lib.vmap(lib.grad(lambda m: loss({"viscosity": m})))(lib.array(viscosities))
-    wanted = [problem.value_and_gradient({"viscosity": m}, estimator)[1]["viscosity"] for m in viscosities]
-    np.testing.assert_array_equal(found, wanted)
 
 
 def test_jacobians_by_both_modes_agree_and_are_mapped(lib, simulation):

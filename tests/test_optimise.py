@@ -2,12 +2,8 @@
 
 import os
 import re
-import signal
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from html import unescape
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +13,7 @@ from cortado import ComputationError, CortadoWarning, DivergedError, InputError,
 from cortado.gradients import EnsembleMean, Estimate
 from cortado.losses import FinalPositions
 from cortado.optimisation.optimise import Record, Result, optimise
-from cortado.optimisation.optimisers import BY_NAME, LBFGS, Adam, GradientDescent, LineSearch
+from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
 from cortado.runs.run_folder import REPLAY_LOG
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 from scenes import plane
@@ -72,20 +68,6 @@ def test_quadratic_of_scalar_and_array_converges(optimiser, iterations):
     assert problem.seen[0]["velocities"].dtype == np.float64
 
 
-@pytest.mark.parametrize(
-    ("optimiser", "iterations", "tolerance"),
-    [
-        (Adam(learning_rate=0.02), 4000, 1e-3),
-        (GradientDescent(learning_rate=1e-3, momentum=0.9), 3000, 1e-3),
-        (LBFGS(), 100, 1e-8),
-    ],
-)
-def test_rosenbrock_converges(optimiser, iterations, tolerance):
-    result = rosenbrock(optimiser, iterations)
-    assert result.parameters["a"] == pytest.approx(1.0, abs=tolerance)
-    assert result.parameters["b"] == pytest.approx(1.0, abs=2.0 * tolerance)
-
-
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
 def test_lbfgs_takes_its_tolerance_from_the_first_gradient(unit):
     class InUnit(Rosenbrock):
@@ -135,25 +117,24 @@ def test_adam_follows_algorithm_1_of_its_paper():
     result = rosenbrock(Adam(alpha, beta_1, beta_2, epsilon), 40)
     found = [(record.parameters["a"], record.parameters["b"]) for record in result.history]
     np.testing.assert_allclose(found, expected, rtol=1e-10)
-    assert result.evaluations == 41
-    assert result.last_parameters == {"a": found[-1][0], "b": found[-1][1]}
+    assert result.evaluations == 41 and result.last_parameters == {"a": found[-1][0], "b": found[-1][1]}
 
 
-def test_momentum_follows_the_heavy_ball():
-    x, before, expected = 3.0, 3.0, [3.0]
-    for _ in range(10):
-        x, before = x - 0.1 * 2.0 * x + 0.7 * (x - before), x
-        expected.append(x)
-    result = optimise(Quadratic({"x": 0.0}, 2.0), {"x": 3.0}, GradientDescent(0.1, momentum=0.7), 10)
-    np.testing.assert_allclose([record.parameters["x"] for record in result.history], expected, rtol=1e-12)
-
-
-def test_learning_rate_by_parameter():
-    start = {"slow": 1.0, "fast": np.array([1.0, 1.0])}
-    problem = Quadratic({"slow": 0.0, "fast": np.zeros(2)})
-    result = optimise(problem, start, GradientDescent({"fast": 0.5, "slow": 0.1}), 1)
-    assert result.last_parameters["slow"] == pytest.approx(0.9)
-    np.testing.assert_allclose(result.last_parameters["fast"], [0.5, 0.5])
+def test_momentum_follows_the_heavy_ball_with_a_learning_rate_for_each_parameter():
+    rates = {"x": 0.1, "y": 0.05}
+    result = optimise(
+        Quadratic({"x": 0.0, "y": np.zeros(2)}, 2.0),
+        {"x": 3.0, "y": np.array([3.0, 3.0])},
+        GradientDescent(rates, momentum=0.7),
+        10,
+    )
+    for name, rate in rates.items():
+        x, before, expected = 3.0, 3.0, [3.0]
+        for _ in range(10):
+            x, before = x - rate * 2.0 * x + 0.7 * (x - before), x
+            expected.append(x)
+        found = [np.ravel(record.parameters[name])[-1] for record in result.history]
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 # ---- whether gradients keep what they promise -----------------------------------------------------------------------
@@ -258,41 +239,31 @@ def test_lbfgs_converges_only_where_its_gradient_is_small():
 
 def test_the_best_is_not_the_last():
     result = optimise(Quadratic({"x": 0.0}), {"x": 1.0}, GradientDescent(learning_rate=3.0), 4)
-    assert result.parameters == {"x": 1.0} and result.loss == 0.5
+    assert result.parameters == {"x": 1.0} and result.loss == 0.5 and not result.converged
     assert result.last_parameters == {"x": 16.0}
-    assert not result.converged
 
 
 # ---- bounds ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("optimiser", [Adam(0.05), GradientDescent(0.2, momentum=0.5), LBFGS(scale=0.3)])
 def test_bounds_are_kept_and_reached(optimiser):
-    problem = Quadratic({"g": np.array([2.0, -2.0, 0.1]), "mu": 0.7})
-    lower, upper = np.array([-1.0, -0.5, -1.0]), 1.0
-    bounds = {"g": (lower, upper), "mu": (None, 0.6)}
-    result = optimise(problem, {"g": np.zeros(3), "mu": 0.5}, optimiser, 200, bounds)
+    """A component with equal bounds stays."""
+    problem = Quadratic({"g": np.array([2.0, -2.0, 0.1, 0.0]), "mu": 0.7})
+    lower, upper = np.array([-1.0, -0.5, -1.0, 0.3]), np.array([1.0, 1.0, 1.0, 0.3])
+    start, bounds = {"g": np.array([0.0, 0.0, 0.0, 0.3]), "mu": 0.5}, {"g": (lower, upper), "mu": (None, 0.6)}
+    result = optimise(problem, start, optimiser, 200, bounds)
     for parameters in problem.seen:
         assert (parameters["g"] >= lower).all() and (parameters["g"] <= upper).all()
         assert parameters["mu"] <= 0.6
-    np.testing.assert_allclose(result.parameters["g"], [1.0, -0.5, 0.1], atol=1e-4)
+    np.testing.assert_allclose(result.parameters["g"], [1.0, -0.5, 0.1, 0.3], atol=1e-4)
     assert result.parameters["mu"] == pytest.approx(0.6, abs=1e-12)
-
-
-def test_lbfgs_knows_its_bounds():
-    result = rosenbrock(LBFGS(), 100, bounds={"a": (None, 0.5)})
-    assert result.parameters["a"] == 0.5
-    assert result.parameters["b"] == pytest.approx(0.25, abs=1e-8)
-
-
-def test_a_component_with_equal_bounds_stays():
-    bounds = {"g": (np.array([-5.0, 0.3]), np.array([5.0, 0.3]))}
-    for optimiser in OPTIMISERS:
-        result = optimise(Quadratic({"g": np.zeros(2)}), {"g": np.array([1.0, 0.3])}, optimiser, 5, bounds)
-        assert {record.parameters["g"][1] for record in result.history} == {0.3}
+    if isinstance(optimiser, LBFGS):
+        result = rosenbrock(optimiser, 100, bounds={"a": (None, 0.5)})
+        assert result.parameters == {"a": 0.5, "b": pytest.approx(0.25, abs=1e-8)}
 
 
 # ---- the line search ------------------------------------------------------------------------------------------------
 class Rough:
-    """A bowl with dents of 0.02 everywhere, whose gradient is that of the bowl; some of it cannot be computed."""
+    """A bowl with dents of 0.02 everywhere, whose gradient is that of the bowl."""
 
     def __init__(self):
         self.tried = []
@@ -300,8 +271,6 @@ class Rough:
     def value(self, parameters):
         x = np.asarray(parameters["x"])
         self.tried.append(x)
-        if x[0] > 2.5:
-            raise DivergedError(step=1, particle=0, advice="")
         return float(x @ x + 0.02 * np.sin(200.0 * x).sum())
 
     def value_and_gradient(self, parameters, gradient=None):
@@ -315,23 +284,6 @@ def test_a_line_search_goes_down_a_rough_slope_and_leaves_its_dents():
     iterates = np.array([record.parameters["x"] for record in optimise(Rough(), start, LineSearch(), 60).history])
     steps = np.abs(np.diff(iterates, axis=0)).max(axis=1)
     assert (steps[-20:] > 0.01).sum() >= 5
-
-
-def test_a_line_search_leaves_runs_that_diverge_aside():
-    """It is led to where runs diverge, and goes as far as it can."""
-
-    class Wrong(Rough):
-        def value_and_gradient(self, parameters, gradient=None):
-            return -parameters["x"][0], {"x": np.array([-1.0, 0.0])}
-
-        def value(self, parameters):
-            super().value(parameters)
-            return -parameters["x"][0]
-
-    problem = Wrong()
-    result = optimise(problem, {"x": np.array([2.0, 0.0])}, LineSearch(scale=2.0), 30)
-    assert max(x[0] for x in problem.tried) > 2.5
-    assert 2.4 < result.parameters["x"][0] <= 2.5
 
 
 @pytest.mark.parametrize("error", [DivergedError(step=1, particle=0, advice=""), InputError("viscosity is below 0.")])
@@ -403,38 +355,13 @@ def test_finished_run_resumes_to_more_and_to_fewer_iterations(optimiser, tmp_pat
     assert unused.evaluations == 0
 
 
-KILLED = """
-import os, signal, sys
-sys.path.insert(0, {tests!r})
-from cortado.optimisation.optimisers import Adam
-from rosenbrock_valley import Rosenbrock, rosenbrock
-
-class Killed(Rosenbrock):
-    def value_and_gradient(self, parameters, gradient=None):
-        if self.evaluations == 17:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().value_and_gradient(parameters, gradient)
-
-rosenbrock(Adam(learning_rate=0.05), problem=Killed(), checkpoint={folder!r})
-"""
-
-
-def test_killed_process_resumes_bit_for_bit(tmp_path):
-    script = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
-    killed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    rest = Rosenbrock()
-    resumed = rosenbrock(Adam(learning_rate=0.05), problem=rest, checkpoint=tmp_path, resume=True)
-    assert rest.evaluations == 31 - 17
-    assert bits(resumed) == bits(rosenbrock(Adam(learning_rate=0.05)))
-
-
-def test_torn_last_record_is_computed_again(tmp_path):
-    optimiser = Adam(learning_rate=0.05)
-    whole = bits(rosenbrock(optimiser, 3, checkpoint=tmp_path))
-    log = tmp_path / REPLAY_LOG
-    content = log.read_bytes()
+def test_torn_last_record_is_computed_again_and_damage_before_it_is_refused(tmp_path):
+    """Every record is in the file before the next evaluation, so that a kill leaves it."""
+    optimiser, log, sizes = Adam(learning_rate=0.05), tmp_path / REPLAY_LOG, []
     record_size = 8 + 8 * 5 + 4
+    whole = bits(rosenbrock(optimiser, 3, checkpoint=tmp_path, on_iteration=lambda _: sizes.append(log.stat().st_size)))
+    assert np.diff(sizes).tolist() == 3 * [record_size]
+    content = log.read_bytes()
     torn = [content[:-cut] for cut in range(1, record_size + 1, 3)]
     torn.append(content[:-record_size] + bytes(record_size))
     torn.append(content[:-1] + bytes([content[-1] ^ 1]))
@@ -442,20 +369,13 @@ def test_torn_last_record_is_computed_again(tmp_path):
         log.write_bytes(remains)
         problem = Rosenbrock()
         assert bits(rosenbrock(optimiser, 3, problem=problem, checkpoint=tmp_path, resume=True)) == whole
-        assert problem.evaluations == 1
-        assert log.read_bytes() == content
-
-
-def test_damage_before_the_last_record_is_refused(tmp_path):
-    optimiser = Adam(learning_rate=0.05)
-    rosenbrock(optimiser, 5, checkpoint=tmp_path)
-    log = tmp_path / REPLAY_LOG
-    content = bytearray(log.read_bytes())
-    content[-100] ^= 1
-    log.write_bytes(content)
-    with pytest.raises(InputError, match=r"Evaluation 4 of the 6 .* damaged"):
-        rosenbrock(optimiser, 5, checkpoint=tmp_path, resume=True)
-    assert log.read_bytes() == content
+        assert problem.evaluations == 1 and log.read_bytes() == content
+    damaged = bytearray(content)
+    damaged[-100] ^= 1
+    log.write_bytes(damaged)
+    with pytest.raises(InputError, match=r"Evaluation 2 of the 4 .* damaged"):
+        rosenbrock(optimiser, 3, checkpoint=tmp_path, resume=True)
+    assert log.read_bytes() == damaged
 
 
 @pytest.mark.parametrize("content", [b"something else\n", b"[" * 100_000, b"\n", b'{"format": 1}\n'])
@@ -483,28 +403,18 @@ def test_other_settings_are_refused_and_leave_the_log(tmp_path):
     with pytest.raises(InputError, match="already holds the evaluations"):
         rosenbrock(optimiser, 5, checkpoint=tmp_path)
     assert (tmp_path / REPLAY_LOG).read_bytes() == before
-
-
-def test_another_problem_is_refused_by_its_fingerprint(tmp_path):
-    one, other = Rosenbrock(), Rosenbrock()
+    one, other, folder = Rosenbrock(), Rosenbrock(), tmp_path / "begun" / "where there is nothing"
     one.fingerprint, other.fingerprint = "60 steps", "61 steps"
-    rosenbrock(Adam(0.05), 2, problem=one, checkpoint=tmp_path)
+    for iterations in (2, 3):  # an estimator without a repr of its own is the same
+        options = {"checkpoint": folder, "resume": True, "gradient": type("Plain", (), {})()}
+        assert rosenbrock(optimiser, iterations, problem=one, **options).evaluations == iterations + 1
     with pytest.raises(InputError, match="problem = 60 steps and is now given problem = 61 steps"):
-        rosenbrock(Adam(0.05), 2, problem=other, checkpoint=tmp_path, resume=True)
-
-
-def test_an_estimator_without_a_repr_of_its_own_can_be_resumed(tmp_path):
-    class Plain:
-        pass
-
-    one, same = Plain(), Plain()
-    rosenbrock(Adam(0.05), 2, checkpoint=tmp_path, gradient=one)
-    assert rosenbrock(Adam(0.05), 3, checkpoint=tmp_path, gradient=same, resume=True).evaluations == 4
-
-
-def test_resume_begins_where_there_is_nothing(tmp_path):
-    folder = tmp_path / "deep" / "run"
-    assert bits(rosenbrock(Adam(0.05), 3, checkpoint=folder, resume=True)) == bits(rosenbrock(Adam(0.05), 3))
+        rosenbrock(optimiser, 2, problem=other, **options)
+    one, other = (lambda parameters: Rosenbrock().value_and_gradient(parameters) for _ in range(2))
+    one.__qualname__ = "valley"
+    assert bits(rosenbrock(optimiser, 2, problem=one, checkpoint=tmp_path / "b")) == bits(rosenbrock(optimiser, 2))
+    with pytest.raises(InputError, match="problem"):
+        rosenbrock(optimiser, 2, problem=other, checkpoint=tmp_path / "b", resume=True)
 
 
 def test_a_checkpoint_that_cannot_be_is_refused(tmp_path):
@@ -537,12 +447,6 @@ class Breaks:
         return (self.loss if broken else float(x**2 + np.sum(parameters["g"] ** 2))), {"x": 2.0 * x, "g": g}
 
 
-def test_a_loss_that_is_not_finite_at_the_start_says_so():
-    start = {"x": 1.0, "g": np.ones((2, 3))}
-    with pytest.raises(ComputationError, match=r"^At the start the loss is nan as a function of 'x', 'g'; begin else"):
-        optimise(Breaks(loss=np.nan, evaluations=2), start, Adam(0.1), 10)
-
-
 @pytest.mark.parametrize("optimiser", [Adam(0.1), GradientDescent(0.1), LBFGS()])
 @pytest.mark.parametrize(
     ("problem", "what"),
@@ -555,6 +459,8 @@ def test_a_loss_that_is_not_finite_at_the_start_says_so():
 )
 def test_not_finite_stops_with_advice_and_keeps_the_rest(optimiser, problem, what, tmp_path):
     start = {"x": 1.0, "g": np.ones((2, 3))}
+    with pytest.raises(ComputationError, match=r"^At the start the (loss is (nan|inf) .*; begin else|gradient)"):
+        optimise(replace(problem, evaluations=2), start, optimiser, 10)
     with pytest.raises(ComputationError, match=f"In evaluation 2 the {what}.*smaller learning rate") as caught:
         optimise(replace(problem), start, optimiser, 10, checkpoint=tmp_path)
     assert str(tmp_path) in str(caught.value)
@@ -750,29 +656,22 @@ def test_a_search_counts_what_its_averages_leave_out_and_warns_once():
 
 # ---- wrong input ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
-    "make",
+    ("kind", "setting", "values"),
     [
-        lambda: Adam(learning_rate=0.0),
-        lambda: Adam(learning_rate=-1.0),
-        lambda: Adam(learning_rate=np.nan),
-        lambda: Adam(learning_rate="fast"),
-        lambda: Adam(learning_rate={"x": 0.0}),
-        lambda: Adam(0.1, beta1=1.0),
-        lambda: Adam(0.1, beta2=-0.1),
-        lambda: Adam(0.1, epsilon=0.0),
-        lambda: GradientDescent(learning_rate=np.inf),
-        lambda: GradientDescent(0.1, momentum=1.0),
-        lambda: LBFGS(memory=0),
-        lambda: LBFGS(memory=10**9),
-        lambda: LineSearch(trials=1),
-        lambda: LineSearch(trials=10**9),
-        lambda: LBFGS(tolerance=-1.0),
-        lambda: LBFGS(scale=0.0),
+        (Adam, "learning_rate", (0.0, np.nan, "fast", {"x": 0.0})),
+        *((Adam, name, (1.0, -0.1)) for name in ("beta1", "beta2")),
+        (Adam, "epsilon", (0.0,)),
+        (GradientDescent, "momentum", (1.0,)),
+        (LBFGS, "memory", (0, 10**9)),
+        (LBFGS, "tolerance", (-1.0,)),
+        (LBFGS, "scale", (0.0,)),
+        (LineSearch, "trials", (1, 10**9)),
     ],
 )
-def test_wrong_settings_are_refused(make):
-    with pytest.raises(InputError, match="must be"):
-        make()
+def test_wrong_settings_are_refused(kind, setting, values):
+    for value in values:
+        with pytest.raises(InputError, match="must be"):
+            kind(**({} if kind in (LBFGS, LineSearch) else {"learning_rate": 0.1}) | {setting: value})
 
 
 @pytest.mark.parametrize(
@@ -781,33 +680,23 @@ def test_wrong_settings_are_refused(make):
         ({"start": {}}, "names no parameter"),
         ({"start": {"x": np.array([1.0, np.nan])}}, "'x' has components that are not finite"),
         ({"start": {"x": "one"}}, "'x' is 'one', but must be a number or an array"),
-        ({"start": {"x": np.ones(2, complex)}}, "'x' is made of complex numbers"),
-        ({"start": {"x": np.ma.array([1.0, 2.0], mask=[0, 1])}}, "'x' is partly masked"),
-        ({"bounds": {"x": (np.zeros(2, complex), None)}}, "lower bound of 'x' is made of complex numbers"),
         ({"bounds": {"x": (None, "2")}}, "upper bound of 'x' is '2'"),
         ({"start": {"x": np.zeros((0, 3))}}, r"'x' has shape \(0, 3\), but must have at least one"),
-        ({"start": {"x": [[1.0], [1.0, 2.0]]}}, r"'x' is \[\[1.0\], \[1.0, 2.0\]\], but must be a number or an array"),
         ({"start": np.ones(2)}, r"^The start is array\(\[1., 1.\]\), but must name its parameters"),
         ({"optimiser": Adam}, "^The optimiser must be an object such as"),
         ({"optimiser": "adm"}, "^The optimiser is 'adm', but must be one of 'adam', 'gradient_descent', 'lbfgs'"),
         ({"optimiser": "gradient_descent"}, "^'gradient_descent' needs 'learning_rate'; its settings are"),
         ({"optimiser": "lbfgs", "learning_rate": 0.1}, "^'learning_rate' is no setting of 'lbfgs', whose settings"),
         ({"optimiser": "adam", "learning_rate": -1.0}, "^learning_rate must be a positive, finite number"),
-        (
-            {"learning_rate": 0.1},
-            "^optimise was given 'learning_rate', but takes settings only with the name of an optimiser",
-        ),
+        ({"learning_rate": 0.1}, "^optimise was given 'learning_rate', but takes settings only with the name of an"),
         ({"optimiser": Adam({"y": 0.1})}, "learning_rate is given for 'y', but the optimised parameters are 'x'"),
         ({"optimiser": LBFGS(scale={})}, "scale is given for none"),
         ({"iterations": 0}, "number of iterations"),
-        ({"iterations": 2.5}, "number of iterations"),
         ({"iterations": 10**12}, "number of iterations must be .* at most 10,000,000, not 1000000000000"),
         ({"bounds": {"y": (0.0, 1.0)}}, "Bounds are given for 'y'"),
         ({"bounds": {"x": (2.0, 3.0)}}, "start of 'x' is outside of its bounds in 2 of 2"),
         ({"bounds": {"x": (3.0, 2.0)}}, "lower bound of 'x' must not exceed"),
-        ({"bounds": {"x": (np.nan, 2.0)}}, "lower bound of 'x' must not exceed"),
         ({"bounds": {"x": (np.zeros(3), None)}}, r"bounds of 'x' must be \(lower, upper\)"),
-        ({"bounds": {"x": 2.0}}, r"bounds of 'x' must be \(lower, upper\)"),
     ],
 )
 def test_wrong_input_is_refused_before_anything_is_evaluated(change, message):
@@ -819,36 +708,13 @@ def test_wrong_input_is_refused_before_anything_is_evaluated(change, message):
 
 
 @pytest.mark.parametrize("optimiser", [LineSearch(trials=1000), LBFGS(memory=1000)])
-def test_what_does_not_fit_into_memory_is_refused_before_anything_is_evaluated(optimiser, monkeypatch):
+def test_what_does_not_fit_into_memory_is_refused(optimiser, monkeypatch):
     monkeypatch.setattr("cortado.device.threads.available", lambda device=None: 1e7)
-    problem = Quadratic({"x": np.zeros(2000)})
     with pytest.raises(InputError, match=r"^This needs about .* of memory, most of it for .*; take fewer"):
-        optimise(problem, {"x": np.ones(2000)}, optimiser, 3)
-    assert not problem.seen
-
-
-def test_a_gradient_of_another_shape_is_refused():
-    class Wrong(Quadratic):
-        def value_and_gradient(self, parameters, gradient=None):
-            loss, gradient = super().value_and_gradient(parameters)
-            return loss, {"x": gradient["x"][:1]}
-
-    with pytest.raises(InputError, match="gradients of shapes"):
-        optimise(Wrong({"x": np.zeros(2)}), {"x": np.ones(2)}, Adam(0.1), 3)
+        optimise(Quadratic({"x": np.zeros(2000)}), {"x": np.ones(2000)}, optimiser, 3)
 
 
 # ---- what is handed on ----------------------------------------------------------------------------------------------
-def test_gradient_and_values_are_handed_on_as_given():
-    problem, estimator = Quadratic({"x": 0.0, "y": 0.0, "z": np.zeros(2)}), object()
-    start = {"x": 1, "y": np.array(1.0), "z": [1, 2]}
-    result = optimise(problem, start, Adam(0.1), 2, gradient=estimator)
-    assert all(found is estimator for found in problem.estimators)
-    for parameters in (result.parameters, result.last_parameters, result.history[0].parameters):
-        assert list(parameters) == ["x", "y", "z"]
-        assert type(parameters["x"]) is float
-        assert isinstance(parameters["y"], np.ndarray) and parameters["y"].shape == ()
-        assert parameters["z"].shape == (2,)
-    assert start == {"x": 1, "y": np.array(1.0), "z": [1, 2]}
 
 
 def test_the_history_is_safe_from_a_problem_that_overwrites_its_arguments():
@@ -877,26 +743,6 @@ def test_an_optimiser_may_be_given_by_its_name(name, settings, optimiser):
     assert bits(rosenbrock(name, **settings)) == bits(rosenbrock(optimiser))
 
 
-def test_every_optimiser_has_a_name_and_the_function_two():
-    assert {type(optimiser) for optimiser in OPTIMISERS} == set(BY_NAME.values())
-    assert cortado.optimize is cortado.optimise
-
-
-def test_a_plain_function_is_optimised(tmp_path):
-    """Bit for bit as an object is; and its name is kept in the checkpoint."""
-
-    def valley(parameters):
-        return Rosenbrock().value_and_gradient(parameters)
-
-    def other(parameters):
-        return valley(parameters)
-
-    found = rosenbrock(LBFGS(), problem=valley, checkpoint=tmp_path)
-    assert bits(found) == bits(rosenbrock(LBFGS()))
-    with pytest.raises(InputError, match="problem"):
-        rosenbrock(LBFGS(), problem=other, checkpoint=tmp_path, resume=True)
-
-
 TWO = "but must return two things: the loss, a number, and its gradient, a dictionary with an array for each parameter"
 TWO += " by its name"
 WRONG_PROBLEMS = [
@@ -906,6 +752,7 @@ WRONG_PROBLEMS = [
     (lambda p: 1.5, {}, f"What is optimised returned 1.5, {TWO}"),
     (lambda p: None, {}, f"What is optimised returned None, {TWO}"),
     (lambda p: (1.0, {"a": 0.0}, 2), {}, f"What is optimised returned a tuple of 3, {TWO}"),
+    (lambda p: (1.0, {"a": np.zeros(2), "b": 0.0}), {}, ".*gradients of shapes"),
     (lambda p: (1.0, np.zeros(2)), {}, f"What is optimised returned a loss and a gradient of type ndarray, {TWO}"),
 ]
 

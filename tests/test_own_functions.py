@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-import cortado
-from cortado import InputError, Problem, Simulation
+from cortado import InputError, Simulation
 from cortado.forces import Body, OverTime, Pair
 from scenes import aimed, plane, splash, two_layers
 
@@ -102,22 +101,10 @@ def test_time_and_an_annotation_may_be_left_out_and_a_default_is_a_parameter():
     assert judged.simulation.parameters()["slow.k"] == 4.0
     assert "time" not in judged.simulation.known
 
-
-def test_one_without_parameters_and_one_for_each_axis():
     def lift(x, v):
         return wp.vec3(0.0, 1.0, 0.0)
 
     assert problem(Body(lift)).value_and_gradient({"time_step": 0.002})[1]["time_step"] != 0.0
-
-
-def test_a_row_for_each_step_is_searched_for():
-    force = Body(gust, k=OverTime([0.0], [20.0]), centre=[0.1] * 3)
-    judged = problem(force)
-    goal = judged.end({"gust.k": np.linspace(20.0, 60.0, STEPS)}).positions
-    judged = Problem(judged.simulation, STEPS, cortado.losses.FinalPositions(goal))
-    start = {"gust.k": np.full(STEPS, 30.0), "gust.wind": [1.0, 0.5, -0.5]}
-    found = cortado.optimise(judged, start, optimiser=cortado.optimisers.LBFGS(), iterations=20)
-    assert found.loss < 1e-3 * judged.value(start)
 
 
 def test_parameters_over_time_of_a_batch():
@@ -138,21 +125,27 @@ def test_a_step_of_a_captured_search_has_the_numbers_of_its_own():
     assert first[0] == first[3] and len(set(first)) == 3
 
 
-def test_another_function_is_another_force_also_by_numbers_from_outside():
-    def made(strength):
+def test_another_function_is_another_force_also_by_values_from_outside():
+    """Where the text is the same: numbers of it and of a function of Warp that it calls, vectors, and courses."""
+
+    def made(strength, scale, centre):
+        @wp.func
+        def scaled(r: wp.float64):
+            return r * wp.float64(scale)
+
         def steady(x, v, k):
-            return k * strength * wp.vec3(1.0, 0.0, 0.0)
+            return scaled(k) * strength * (centre - x)
 
-        return Body(steady, k=1.0)
+        return problem(Body(steady, k=1.0))
 
-    one, other = problem(made(1.0)), problem(made(2.0))
-    assert one.fingerprint != other.fingerprint
-    fast, slow = (judged.run({}).velocities[-1][:, 0].mean() for judged in (other, one))
-    assert fast > 1.9 * slow
-    assert problem(made(1.0)).fingerprint == one.fingerprint
+    ends, values = {}, ((1.0, 1.0, 0.0), (2.0, 1.0, 0.0), (1.0, 20.0, 0.0), (1.0, 1.0, 9.0))
+    for strength, scale, x in values:
+        judged = made(strength, scale, wp.vec3d(x, 0.0, 0.0))
+        ends[judged.fingerprint] = judged.run({}).velocities[-1].tobytes()
+    assert len(ends) == len(set(ends.values())) == 4
+    assert made(1.0, 1.0, wp.vec3d(0.0, 0.0, 0.0)).fingerprint == next(iter(ends))
     courses = [OverTime([0.0, 1.0], [1.0, last]) for last in (2.0, 3.0)]
-    texts = {problem(Body(gust, k=course, centre=[0.1] * 3)).fingerprint for course in courses}
-    assert len(texts) == 2
+    assert len({problem(Body(gust, k=course, centre=[0.1] * 3)).fingerprint for course in courses}) == 2
 
 
 def test_what_it_is_made_with_stays():
@@ -201,35 +194,21 @@ def helping_itself(r: wp.float64):
 """
 NO_FORCES = {
     "calls itself": ("def f(x, v): return f(x, v)", "Body function f calls itself, but must not"),
-    "calls what calls itself": (
-        "def f(x, v): return helping_itself(x[0]) * v",
-        "helping_itself that Body function f calls calls itself",
-    ),
+    "calls what calls itself": ("def f(x, v): return helping_itself(x[0]) * v", "helping_itself that Body function f"),
     "waits": ("async def f(x, v): return x", "Body function f waits or yields, but must be made by def"),
-    "yields": ("def f(x, v): yield x", "Body function f waits or yields, but must be made by def"),
     "no axis": ("def f(x, v): return x[3] * v", r"function f has x\[3\], but must have an index of 0, 1 or 2 there"),
     "order": ("def f(v, x, k): return -k * v", "f has the arguments v, x, k, but must have x, v first, and"),
     "one": ("def f(x): return x", "Body function f has x without a value, but must have"),
     "many": ("def f(x, v, *rest): return v", r"Body function f has the argument \*rest, but must have"),
     "time": ("def f(x, v, t=0.0, k=1.0): return -k * t * v", "f is given a value of t, but the run gives it"),
-    "no return": ("def f(x, v, k): wp.length(x)", "f may end without return, but must return a vector"),
     "some return": ("def f(x, v, k):\n if x[0] < 0.1: return k * v", "Body function f may end without return"),
     "unknown": ("def f(x, v, k): return k * undefined(v)", "f has the name .*, which is not defined"),
     "list": ("def f(x, v, k): return k * AWAY", "AWAY, which is a list outside of it, but must take a number"),
     "named part": ("def f(x, v, k):\n a = k * x\n a.y = 0.0\n return a", "changes a.y alone, which Warp cannot differ"),
-    "added part": ("def f(x, v, k):\n a = k * x\n a.y += k\n return a", "changes a.y alone, which Warp cannot differ"),
     "called part": ("def f(x, v, k): return k * flattened(x)", "function f changes a.y alone, which Warp cannot"),
-    "index": (
-        "def f(x, v, k):\n a = -k * v\n a[1] = 0.0\n return a",
-        r"changes a\[1\] alone, which Warp cannot differ",
-    ),
     "long loop": (
         "def f(x, v, k):\n for _ in range(257): v = v * 0.5\n return k * v",
         r"f has 'for _ in range\(257\)', which Warp cannot differ",
-    ),
-    "while": (
-        "def f(x, v, k):\n while k > 1.0: k = k - 1.0\n return k * v",
-        "f has 'while k > 1.0', which Warp cannot differ",
     ),
     "break": (
         "def f(x, v, k):\n for axis in range(3):\n  if v[axis] > 0.0: break\n return k * v",
@@ -238,14 +217,8 @@ NO_FORCES = {
     "called while": ("def f(x, v, k): return k * looping(x[0]) * v", "f has 'while r > 1.0', which Warp cannot differ"),
     "no vector": ("def f(x, v, k): return k", "Body function f cannot be compiled: .* return a vector"),
     "NumPy": ("def f(x, v, k): return -k * np.tanh(v)", "Body function f cannot be compiled: "),
-    "compares": (
-        "def f(x, v):\n if v < x: return v\n return x",
-        r"f cannot be compiled: invalid operands .* \(a vector and a vector\); it must use numbers",
-    ),
-    "nested": (
-        "def f(x, v): return wp.vec3(x, v[0], 1.0)",
-        "f cannot be compiled: no matching constructor for initialization of a vector; it must",
-    ),
+    "compares": ("def f(x, v):\n if v < x: return v\n return x", r"f cannot be compiled: invalid operands .* numbers"),
+    "nested": ("def f(x, v): return wp.vec3(x, v[0], 1.0)", "f cannot be compiled: no matching constructor for ini"),
 }
 
 
@@ -266,9 +239,7 @@ def test_what_is_no_force_is_a_sentence(name, tmp_path, capfd):
     [
         (lambda: Body(3.0), "Body has 3.0, but must have a function, made by def"),
         (lambda: Body(lambda x, v, k: -k * v, k=1.0), "Body function <lambda> is no definition, but must be"),
-        (lambda: Body(np.sin, k=1.0), "Body has <ufunc 'sin'>, but must have a function"),
         (lambda: Body(drag), "Body function drag is given no value of k, but must have one of each parameter"),
-        (lambda: Body(three, k=1.0), "Body function three is given no value of c, but must have"),
         (lambda: Body(three, c=[1.0, 0.0, 0.0]), "Body function three is given no value of k, but must have"),
         (lambda: Pair(time_second, k=1.0), "time_second has the arguments .*, but must have x_ij, v_ij first"),
         (lambda: Body(drag, k=1.0, x=2.0), "drag is given a value of x, but the run gives it"),
@@ -280,7 +251,6 @@ def test_what_is_no_force_is_a_sentence(name, tmp_path, capfd):
         (lambda: problem(Body(drag, k=[1.0, 2.0])), r"parameter drag.k has shape \(2,\), but must be \(3,\)"),
         (lambda: OverTime([0.0, 0.0], [1.0, 2.0]), "OverTime times are .*, but each must be greater than the one"),
         (lambda: OverTime([0.0], [1.0, 2.0]), r"OverTime values have shape \(2,\), but must be \(1,\) or \(1, d\)"),
-        (lambda: OverTime([0.0], [math.nan]), "OverTime values have one that is not finite"),
         (lambda: OverTime([], []), "OverTime times are .*, but must be a list of finite times"),
     ],
 )
@@ -300,26 +270,6 @@ def test_the_forces_of_the_page_run_as_printed(tmp_path, monkeypatch):
     runpy.run_path(str(program))
 
 
-def test_values_from_outside_of_what_it_calls_count_too():
-    """The text is the same: what differs is a number of a function of Warp, or a vector."""
-
-    def made(strength, centre):
-        @wp.func
-        def scaled(r: wp.float64):
-            return r * wp.float64(strength)
-
-        def steady(x, v, k):
-            return scaled(k) * (centre - x)
-
-        return Body(steady, k=1.0)
-
-    ends = {}
-    for strength, centre in ((1.0, 0.0), (20.0, 0.0), (1.0, 9.0)):
-        judged = problem(made(strength, wp.vec3d(centre, 0.0, 0.0)))
-        ends[judged.fingerprint] = judged.run({}).velocities[-1].tobytes()
-    assert len(ends) == 3 and len(set(ends.values())) == 3
-
-
 CALM = wp.vec3(0.25, -0.5, 0.0)
 
 
@@ -333,8 +283,6 @@ def with_numbers(x, v, k):
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_vector_from_outside_is_one_of_the_precision(precision):
-    ends = [
-        Simulation(plane(), precision=precision, forces=[Body(force, k=2.0)]).run(3).positions[-1]
-        for force in (with_vector, with_numbers)
-    ]
+    given = ({"precision": precision, "forces": [Body(force, k=2.0)]} for force in (with_vector, with_numbers))
+    ends = [Simulation(plane(), **own).run(3).positions[-1] for own in given]
     assert ends[0].tobytes() == ends[1].tobytes()

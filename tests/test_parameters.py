@@ -16,7 +16,6 @@ from cortado.particles.state import Fields, Layout
 from cortado.particles.wall_terms import SolidShares
 from cortado.scene.parameter_values import scene_values
 from cortado.scene.parameters import BY_NAME, PARAMETERS, Role, names
-from cortado.solvers.pcisph.solver import PcisphAdjoint
 from cortado.sph.gravity import Gravity
 from cortado.sph.parts import Adjoints, Shares
 from scenes import plane, plane_of_three, scene, splash
@@ -32,13 +31,6 @@ def test_the_document_has_the_table_of_the_registry():
 def test_the_docstring_of_a_problem_names_every_parameter():
     missing = [parameter.name for parameter in PARAMETERS if f"``{parameter.name}``" not in Problem.__doc__]
     assert missing == [], "name them in the docstring of Problem, src/cortado/problem.py"
-
-
-def test_every_parameter_of_steps_is_on_the_device():
-    found = Simulation(plane_of_three()).solver.new_parameters(7)
-    assert found.names == names(Role.RUN)
-    shapes = {"gravity": (1, 7), "rest_density": (1, 3), "viscosity": (1, 3)}
-    assert {name: found[name].shape for name in found.names} == {name: shapes.get(name, (1,)) for name in found.names}
 
 
 @pytest.mark.parametrize("made", [scene, plane_of_three])
@@ -79,30 +71,14 @@ def test_a_rollout_takes_derivatives_of_its_own_alone():
         rollout.backward(Exact().derivative(rollout), {7: simulation.initial})
 
 
-@pytest.fixture(scope="module")
-def simulation():
-    return Simulation(plane())
-
-
-@pytest.mark.parametrize("given", [None, [1.0], 3, "gravity"])
-def test_parameters_are_a_table(simulation, given):
-    problem = Problem(simulation, 3, losses.FinalPositions(simulation.positions))
+@pytest.mark.parametrize("given", [None, [1.0], "gravity"])
+def test_parameters_are_a_table(given):
+    simulation = Simulation(plane())
+    loss = losses.FinalPositions(simulation.positions)
     with pytest.raises(InputError, match=r"parameters are .*, but must be a table by name, such as \{'gravity'"):
-        problem.value(given)
-
-
-@pytest.mark.parametrize("budget", ["8GB", -1, 1.5, None])
-def test_a_memory_budget_is_a_number_of_bytes(simulation, budget):
+        Problem(simulation, 3, loss).value(given)
     with pytest.raises(InputError, match=r"memory_budget is .* must be a whole number of at least 0"):
-        Problem(simulation, 3, losses.FinalPositions(simulation.positions), memory_budget=budget)
-
-
-def test_a_part_that_forgets_its_shares_is_an_error():
-    """Its kernel would write (n,) numbers into the one of the parameter."""
-    solver = Simulation(plane_of_three()).solver
-    bar = solver.adjoint(2).bar
-    known = {name for group in bar.named for name in group}
-    assert {"x_bar", "gravity_bar", "viscosity_bar", "time_step_bar"} <= known and "surface_tension_bar" not in known
+        Problem(simulation, 3, loss, memory_budget=given)
 
 
 class Tensor:
@@ -117,71 +93,48 @@ class Tensor:
         return np.array(self.values, dtype=dtype)
 
 
-@pytest.mark.parametrize(
-    "value, wanted",
-    [
+def test_numbers_are_taken():
+    """Arrays of Warp too, and those in float64 without a copy."""
+    values = np.zeros(3)
+    assert as_numbers("gravity", values) is values and as_one_number("the loss", np.array(2)) == 2.0
+    for given, wanted in (
         (3, 3.0),
-        ([1, 2.5], [1.0, 2.5]),
         (np.array([1, 2], np.uint8), [1.0, 2.0]),
-        (np.array([1.5], np.float16), [1.5]),
         ([10**30, Fraction(1, 2)], [1e30, 0.5]),
         (range(3), [0.0, 1.0, 2.0]),
         (np.ma.array([1.0, 2.0]), [1.0, 2.0]),
         (Tensor([1.0, 2.0]), [1.0, 2.0]),
-    ],
-)
-def test_numbers_are_taken(value, wanted):
-    found = as_numbers("gravity", value)
-    assert type(found) is np.ndarray and found.dtype == np.float64
-    np.testing.assert_array_equal(found, wanted)
+        (wp.array(np.ones((2, 3)), dtype=wp.vec3f, device="cpu"), np.ones((2, 3))),
+    ):
+        found = as_numbers("gravity", given)
+        assert type(found) is np.ndarray and found.dtype == np.float64
+        np.testing.assert_array_equal(found, wanted)
 
 
-def test_arrays_are_taken():
-    """Those of Warp, and in float64 without a copy."""
-    vectors, values = wp.array(np.ones((2, 3)), dtype=wp.vec3f, device="cpu"), np.zeros(3)
-    np.testing.assert_array_equal(as_numbers("positions", vectors), np.ones((2, 3)))
-    assert as_numbers("gravity", values) is values
-
-
-ENDLESS: list = []
-ENDLESS.append(ENDLESS)
-
-
-@pytest.mark.parametrize(
-    "value, found",
-    [
+@pytest.mark.filterwarnings("error")
+def test_what_is_not_made_of_real_numbers_is_a_sentence():
+    endless = []
+    endless.append(endless)
+    for value, found in (
         (1j, "1j"),
         (np.array([1 + 0j, 2]), "made of complex numbers"),
-        ("1.5", "'1.5'"),
         (["1", "2"], "made of text"),
-        (np.array([b"1"]), "made of text"),
         (True, "True"),
         (np.array([True, False]), "made of True and False"),
         (np.array(["2020-01-01"], "M8[D]"), "made of dates"),
-        (np.ma.array([1.0, 2.0, 3.0], mask=[1, 0, 1]), "partly masked"),
         ([np.ma.array([1.0, 2.0], mask=[0, 1]), [1.0, 2.0]], "partly masked"),
-        (np.ma.masked, "partly masked"),
         (np.array([None, 1.0]), "None"),
-        (np.array([True, 1.0], object), "True"),
         ([[1.0], [1.0, 2.0]], "[[1.0], [1.0, 2.0]]"),
         (10**400, "1000"),
-        (None, "None"),
         ({"x": 1.0}, "a table"),
         (Tensor([1.0], RuntimeError("it requires grad")), "Tensor"),
-        (ENDLESS, "[[...]]"),
-    ],
-)
-@pytest.mark.filterwarnings("error")
-def test_what_is_not_made_of_real_numbers_is_a_sentence(value, found):
-    with pytest.raises(InputError) as caught:
-        as_numbers("gravity", value)
-    sentence = str(caught.value)
-    assert sentence.startswith("gravity is ") and found in sentence and "must be a number or an array" in sentence
-    assert "\n" not in sentence and len(sentence) < 200
-
-
-def test_one_number_is_no_array():
-    assert as_one_number("the loss", np.array(2)) == 2.0
+        (endless, "[[...]]"),
+    ):
+        with pytest.raises(InputError) as caught:
+            as_numbers("gravity", value)
+        sentence = str(caught.value)
+        assert sentence.startswith("gravity is ") and found in sentence and "must be a number or an array" in sentence
+        assert "\n" not in sentence and len(sentence) < 200
     with pytest.raises(InputError, match=r"the loss has shape \(1,\), but must be one number"):
         as_one_number("the loss", [2.0])
 
@@ -206,12 +159,3 @@ def test_gravity_adds_to_its_adjoint():
 def test_what_cannot_be_shared_is_said(shares):
     with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of some of rest_density, "):
         Shares([shares], Layout(3, 1, FLOAT64, "cpu"))
-
-
-def test_what_parts_added_to_parameters_is_kept_to_the_end():
-    solver = Simulation(plane_of_three(), precision="float64").solver
-    adjoint = PcisphAdjoint(solver, steps=2)
-    for array in adjoint.bar.parameters.arrays():
-        array.fill_(0.5)
-    for array in adjoint.collect().arrays():
-        np.testing.assert_array_equal(array.numpy(), 0.5)

@@ -39,9 +39,7 @@ def test_problems_and_runs_share_a_simulation(simulation, problem):
         assert gradient.tobytes() == found[1][name].tobytes()
 
 
-@pytest.mark.parametrize(
-    ("estimator", "steps"), [(gradients.Exact(), 30), (gradients.Tape(), 8)], ids=["exact", "tape"]
-)
+@pytest.mark.parametrize(("estimator", "steps"), [(gradients.Exact(), 30), (gradients.Tape(), 8)])
 def test_an_interruption_leaves_nothing_behind(simulation, estimator, steps, monkeypatch):
     loss, point = losses.FinalPositions(np.zeros((125, 3))), {**GRAVITY, "initial_positions": simulation.positions}
     problem, fresh = (Problem(simulation, steps, loss) for _ in range(2))
@@ -117,43 +115,6 @@ def test_fingerprints_tell_problems_apart(simulation, problem):
     assert len({Problem(s, 1, losses.FinalPositions(s.positions)).fingerprint for s in made}) == 3
 
 
-MISTAKES = {
-    "unknown name": lambda p: p.value({"gravty": 1.0}),
-    "text": lambda p: p.value({"gravity": "down"}),
-    "ragged": lambda p: p.value({"gravity": [[1.0], [1.0, 2.0]]}),
-    "shape of gravity": lambda p: p.value({"gravity": np.zeros((59, 3))}),
-    "components": lambda p: p.value({"gravity": [0.0, -9.81]}),
-    "NaN": lambda p: p.value({"viscosity": np.nan}),
-    "negative viscosity": lambda p: p.value({"viscosity": -1.0}),
-    "time step 0": lambda p: p.value({"time_step": 0.0}),
-    "density 0": lambda p: p.value({"rest_density": 0.0}),
-    "shape of positions": lambda p: p.value({"initial_positions": np.zeros((3, 3))}),
-    "array for a number": lambda p: p.value({"viscosity": [0.1, 0.2]}),
-    "unknown direction": lambda p: p.tangent(GRAVITY, {"speed": 1.0}),
-    "estimator by name": lambda p: p.value_and_gradient(GRAVITY, gradient="exact"),
-    "estimator class": lambda p: p.value_and_gradient(GRAVITY, gradient=gradients.Exact),
-    "loss is an array": lambda p: Problem(p.simulation, 10, np.zeros((125, 3))),
-    "steps 0 of a run": lambda p: p.simulation.run(0),
-    "steps -1": lambda p: Problem(p.simulation, -1, p.loss),
-    "steps 1.5": lambda p: Problem(p.simulation, 1.5, p.loss),
-    "steps None": lambda p: Problem(p.simulation, None, p.loss),
-    "simulation is a file": lambda p: Problem("scene.toml", 10, p.loss),
-    "scene is a number": lambda p: Simulation(3),
-    "device": lambda p: Simulation(p.simulation.scene, device="gpu7"),
-    "precision": lambda p: Simulation(p.simulation.scene, precision="float16"),
-    "target's shape": lambda p: Problem(p.simulation, 2, losses.FinalPositions(np.zeros((7, 3)))).value(GRAVITY),
-    "record_every": lambda p: p.simulation.run(2, record_every=0),
-    "controls": lambda p: p.simulation.run(2, controls={"wind": 1.0}),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_a_sentence(problem, mistake):
-    with one_sentence() as caught:
-        mistake(problem)
-    assert len(str(caught.value)) < 300
-
-
 class Wrong(losses.FinalPositions):
     def adjoint(self, end):
         return np.zeros((7, 3)), np.zeros((7, 3))
@@ -175,18 +136,15 @@ def test_checkpoints_fit_where_they_can(steps):
         assert alive <= max(affordable, 2 * np.sqrt(steps) + 3)
 
 
-def test_a_first_state_is_not_overwritten_by_the_next_evaluation(simulation):
-    problem, x = Problem(simulation, 0, losses.FinalPositions(simulation.positions)), simulation.positions
-    first = problem.end({"initial_positions": x + 0.01})
-    problem.end({"initial_positions": x})
-    np.testing.assert_array_equal(first.positions, x + 0.01)
-
-
 def test_without_steps_there_are_no_rows(simulation):
-    problem = Problem(simulation, 0, losses.FinalPositions(np.zeros((125, 3))))
+    """And a first state is not overwritten by the next evaluation."""
+    problem, x = Problem(simulation, 0, losses.FinalPositions(np.zeros((125, 3)))), simulation.positions
     with pytest.raises(InputError, match=r"has shape \(0, 3\), but must be \(3,\) in"):
         problem.value({"gravity": np.zeros((0, 3))})
     assert not problem.value_and_gradient(GRAVITY)[1]["gravity"].any()
+    first = problem.end({"initial_positions": x + 0.01})
+    problem.end({"initial_positions": x})
+    np.testing.assert_array_equal(first.positions, x + 0.01)
 
 
 def test_a_forward_pass_is_gone_back_through_after_other_evaluations(problem, simulation):
@@ -199,6 +157,9 @@ def test_a_forward_pass_is_gone_back_through_after_other_evaluations(problem, si
     problem.value({"gravity": [1.0, -5.0, 0.0]})
     found = forward_pass.back(gradients.Exact())
     assert {name: bar.tobytes() for name, bar in found.items()} == {name: bar.tobytes() for name, bar in wanted.items()}
+    del forward_pass
+    problem.value_and_gradient(GRAVITY)
+    assert not problem._rollout.pending  # of evaluations that nobody holds
 
 
 @pytest.mark.parametrize("budget", [2**30, 0])
@@ -223,12 +184,6 @@ def test_interleaved_evaluations_have_the_bits_of_evaluations_in_turn(make, esti
             assert found[name].tobytes() == bar.tobytes(), (number, name)
 
 
-def test_an_evaluation_that_nobody_holds_leaves_nothing(problem):
-    for _ in range(3):
-        problem.value_and_gradient(GRAVITY)
-    assert not problem._rollout.pending
-
-
 class Overflowing:
     """A loss whose adjoint is beyond all numbers."""
 
@@ -246,42 +201,37 @@ def test_a_gradient_that_is_not_finite_is_warned_of(simulation):
         Problem(simulation, 3, Overflowing()).value_and_gradient(GRAVITY)
 
 
-@pytest.mark.parametrize("steps", [10**400, 2.5, "3", None, np.inf, 0, -1])
-def test_numbers_of_steps_that_cannot_be_are_sentences(simulation, steps):
-    with pytest.raises(InputError, match=r"steps is .*, but must be"):
-        simulation.run(steps)
-    with pytest.raises(InputError, match=r"record_every is .*, but must be"):
-        simulation.run(3, record_every=steps)
-
-
 @pytest.mark.parametrize(
     ("call", "said"),
     [
+        (lambda it: it.value({"gravty": 1.0}), "gravty"),
+        (lambda it: it.value({"gravity": np.zeros((59, 3))}), r"shape \(59, 3\), but must be"),
+        (lambda it: it.value({"gravity": [0.0, -9.81]}), r"shape \(2,\), but must be"),
+        (lambda it: it.value({"viscosity": -1.0}), "must be at least 0"),
+        (lambda it: it.value({"rest_density": 0.0}), "must be greater than 0"),
+        (lambda it: it.value({"initial_positions": np.zeros((3, 3))}), r"shape \(3, 3\), but must be"),
+        (lambda it: it.value({"viscosity": [0.1, 0.2]}), r"shape \(2,\), but must be"),
+        (lambda it: it.tangent(GRAVITY, {"speed": 1.0}), "speed"),
+        (lambda it: it.value_and_gradient(GRAVITY, gradient=gradients.Exact), "estimator is <class"),
+        (lambda it: Problem(it.simulation, 10, np.zeros((125, 3))), "loss"),
+        (lambda it: Problem(it.simulation, 2, losses.FinalPositions(np.zeros((7, 3)))).value(GRAVITY), "shape"),
+        (lambda it: Simulation(it.simulation.scene, device="gpu7"), "gpu7"),
+        (lambda it: it.simulation.run(2, controls={"wind": 1.0}), "wind"),
+        (lambda it: it.simulation.run(10**400), r"steps is .*, but must be"),
+        (lambda it: it.simulation.run(3, record_every=0), r"record_every is .*, but must be"),
         (lambda it: Problem(it.simulation, 3), r"^Problem is given no loss, but must be called as Problem"),
-        (lambda it: cortado.optimise(it, {}, "adam"), "^optimise is given no iterations, but must be called as"),
         (lambda it: cortado.certify(it, nmes=["gravity"]), "certify is called in a wrong way .* 'nmes'"),
-        (lambda it: Simulation(), "^Simulation is given no scene, but must be called as Simulation"),
-        (lambda it: cortado.forces.Body(k=1.0), r"^Body is given no function, .* as Body\(function, name, \*\*param"),
-        (lambda it: cortado.losses.SensorMatch(3), "^SensorMatch is given no target, but must be called as SensorM"),
-        (lambda it: cortado.sensors.WaveGauge(rad=1.0), "^WaveGauge is given no position, but must be called as Wave"),
-        (lambda it: cortado.measured.Tracks(), "^Tracks is given no simulation, but must be called as Tracks"),
-        (lambda it: cortado.render.Renderer(1), "^Renderer is given no lower, but must be called as Renderer"),
-        (lambda it: cortado.evaluate(it), "^evaluate is given no points, but must be called as evaluate"),
         (lambda it: it.simulation.run(number=3), "^Simulation.run is called in a wrong way .*'number'"),
-        (lambda it: it.tangent({}), "^Problem.tangent is given no directions, but must be called as Problem.tangent"),
-        (lambda it: cortado.load_scene(), "^load_scene is given no path, but must be called as load_scene"),
-        (
-            lambda it: Problem(it.simulation, 5, Wrong(it.simulation.positions)).value_and_gradient(GRAVITY),
-            r"adjoint of positions has shape \(7, 3\)",
-        ),
+        (lambda it: Problem(it.simulation, 5, Wrong(np.zeros((125, 3)))).value_and_gradient(GRAVITY), r"shape .7, 3"),
         (lambda it: without_volume(), r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"),
         (lambda it: Simulation(plane_of_three(), free_energy="miscible"), "^free_energy is .miscible., but must be a"),
         (lambda it: Simulation(splash(), free_energy=MISCIBLE), r"left out, as the scene has only one phase\.$"),
     ],
 )
 def test_what_does_not_fit_is_a_sentence(problem, call, said):
-    with pytest.raises(InputError, match=said):
+    with one_sentence(said) as caught:
         call(problem)
+    assert len(str(caught.value)) < 300
 
 
 def test_a_warning_points_at_the_line_that_led_to_it():

@@ -5,7 +5,6 @@ import pytest
 
 from cortado import InputError, Problem, Scene, SceneError, Simulation
 from cortado.discretise.solid import Mass
-from cortado.losses import Series
 from cortado.sensors import SolidLoad, WallForce
 from scenes import Squares, simulated
 from test_free_bodies import RAFT
@@ -79,7 +78,7 @@ def of_loads(scene):
 
 
 SEEN = {
-    "projection": lambda: plane(ROTOR, POST, **KINDS["projection, implicit"]),
+    "projection": lambda: plane(ROTOR, POST),
     "pcisph": lambda: plane(ROTOR, POST, solver=PCISPH),
     "pairwise": SCENES["pairwise"],
     "periodic": SCENES["periodic"],
@@ -106,13 +105,6 @@ def test_loads_have_derivatives(name):
     if name == "projection":
         point["time_step"], along["time_step"] = np.array(0.001), np.array(1e-4)
     check(problem, point, along)
-
-
-def test_a_series_of_a_load_has_a_gradient():
-    scene = plane(ROTOR)
-    loss = Series(SolidLoad("rotor"), [0.0, 0.005], np.zeros((2, 3)), 0.001)
-    problem = Problem(simulated(scene), STEPS, loss)
-    check(problem, {"viscosity": np.array(1.0)}, {"viscosity": np.array(0.3)})
 
 
 def test_loads_of_a_batch_are_those_of_single_scenes_and_twice_the_same():
@@ -148,7 +140,6 @@ def test_after_the_last_step_a_solid_goes_on():
 MISTAKES = [
     (lambda: SolidLoad(3), "solid is 3, but must be the name of a solid"),
     (lambda: Simulation(plane(ROTOR)).run(1, sensors={"a": SolidLoad("cup")}), "solid 'cup', but the scene has rotor"),
-    (lambda: Simulation(plane()).quantity("cup.load"), "solid 'cup', but the scene has none"),
     (lambda: Simulation(plane(ROTOR)).run(1, record=["rotor.load"]), "record is 'rotor.load', but must be one of"),
     (lambda: plane(ROTOR, sensor=[{"kind": "solid_load", "name": "a", "solid": "cup"}]), "solid.*the name of a solid"),
     (lambda: plane(sensor=[{"kind": "solid_load", "name": "a", "solid": "cup"}]), "of a scene with solids"),

@@ -71,9 +71,8 @@ def number(name):
 def problem_of(steps=12, solver=None, **options):
     simulation = Simulation(moving(), precision="float64", solver=solver or MakeRemembering())
     target = simulation.positions + 0.05 * np.sin(np.arange(simulation.positions.size)).reshape(-1, 2)
-    return Problem(
-        simulation, steps, losses.Frames(dict.fromkeys((7, steps), losses.FinalPositions(target))), **options
-    )
+    loss = losses.Frames(dict.fromkeys((7, steps), losses.FinalPositions(target)))
+    return Problem(simulation, steps, loss, **options)
 
 
 SCENE = """
@@ -104,6 +103,7 @@ def test_derivatives_go_through_what_the_solver_carries():
     for name in at:
         np.testing.assert_allclose(taped[name], gradient[name], rtol=1e-9, atol=1e-12 * np.abs(gradient[name]).max())
     assert central_difference(problem.value, at, along, 1e-6) == pytest.approx(slope, rel=1e-6)
+    assert cortado.certify(problem, {name: POINT[name] for name in ("gravity", "memory.rate")}).right
 
 
 def test_states_that_are_computed_again_carry_the_same():
@@ -111,10 +111,6 @@ def test_states_that_are_computed_again_carry_the_same():
     assert again._rollout._interval > 1
     for name, gradient in kept.value_and_gradient(POINT)[1].items():
         assert again.value_and_gradient(POINT)[1][name].tobytes() == gradient.tobytes()
-
-
-def test_the_certificate_judges_any_solver():
-    assert cortado.certify(problem_of(), {name: POINT[name] for name in ("gravity", "memory.rate")}).right
 
 
 def test_an_explicit_solver_is_certified():
@@ -130,14 +126,6 @@ def test_an_explicit_solver_is_certified():
         np.testing.assert_allclose(taped[name], exact[name], rtol=1e-9)
     slope = sum(float(np.sum(exact[name])) for name in names)
     assert problem.tangent(at, {name: np.ones_like(at[name]) for name in names}) == pytest.approx(slope, rel=1e-9)
-
-
-def test_a_parameter_of_a_solver_is_searched_for():
-    judged = problem_of()
-    goal = judged.end({"memory.rate": 0.15}).positions
-    judged = Problem(judged.simulation, 12, losses.FinalPositions(goal))
-    found = cortado.optimise(judged, {"memory.rate": 0.3}, optimiser=cortado.optimisers.LBFGS(), iterations=12)
-    np.testing.assert_allclose(found.parameters["memory.rate"], 0.15, rtol=1e-3)
 
 
 def test_a_solver_goes_to_other_processes_and_other_precisions():
@@ -219,26 +207,19 @@ class Uncounted(Falling):
     ("solver", "options", "said"),
     [
         (3.0, {}, r"solver is 3.0, but must be an object with a method build\(setting\)"),
-        ("pcisph", {}, "solver is 'pcisph', but must be an object"),
         (MakeFalling, {}, "solver is <class .*>, but must be an object"),
-        (Wrong(None), {}, "build of the solver Wrong returned None, but must return a solver"),
         (Wrong(None, "k"), {}, "the solver <.*> has parameters 'k', but must have a list"),
         (Wrong(None, [number("gravity")]), {}, "parameter gravity of a solver has the name of another one"),
         (MakeRemembering(np.nan), {}, "parameter memory.rate has a value that is not finite"),
         (MakeFalling(), {"batch": 2}, "batch is 2, but must be left out, as the solver MakeFalling has no batches"),
         (Makes(ParticleSolver), {}, "build of the solver Makes returned .*, which has no step, but must have one"),
+        (Makes(Uncounted), {}, r"solver Uncounted does not count its steps: .* self\.end_step"),
         (Wrong(Alone()), {"forces": [Breeze()]}, "forces is given, but must be left out, as the solver Wrong takes no"),
     ],
 )
 def test_a_solver_that_does_not_fit_is_a_sentence(solver, options, said):
     with pytest.raises(InputError, match=said):
-        Simulation(plane(), solver=solver, **options)
-
-
-def test_a_solver_that_does_not_count_its_steps_is_a_sentence():
-    simulation = Simulation(plane(), solver=Makes(Uncounted))
-    with pytest.raises(InputError, match=r"solver Uncounted does not count its steps: .* self\.end_step"):
-        simulation.run(3)
+        Simulation(plane(), solver=solver, **options).run(3)
 
 
 def run_command(tmp_path, monkeypatch, kind):

@@ -77,18 +77,11 @@ def test_a_task_without_a_check_asks_for_nothing(task_file):
     assert isinstance(task.optimise.algorithm(), Adam)
 
 
-def test_overrides_replace_values(task_file):
-    task = load_task(task_file, ["optimise.iterations=3", "problem.target.viscosity=0.1", "solver.time_step=0.001"])
-    assert (task.optimise.iterations, task.scene.solver.time_step) == (3, 0.001)
-    assert task.problem.target["viscosity"].shape == () and task.problem.target["viscosity"] == 0.1
-
-
 @pytest.mark.parametrize(
     ("name", "more", "wanted"),
     [
         ("adam", [], Adam(0.5)),
         ("gradient_descent", [], GradientDescent(0.5)),
-        ("lbfgs", [], LBFGS(scale=0.5)),
         ("lbfgs", ["optimise.tolerance=1e-5"], LBFGS(scale=0.5, tolerance=1e-5)),
     ],
 )
@@ -111,16 +104,9 @@ def test_gravity_may_change_with_time(task_file, target, start, wanted):
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-15)
 
 
-def test_a_tilt_is_a_parameter_over_time(task_file):
-    task_file.write_text(GOOD_TASK.replace("gravity", "tilt").replace("[1.5, -9.81]", "[[9.0], [-3.0]]"))
-    task = load_task(task_file, ["optimise.start.tilt=[[0],[0]]", "optimise.knots=2", "optimise.bounds.tilt=[-30,30]"])
-    np.testing.assert_allclose(task.true_parameters["tilt"], [[9.0], [6.0], [3.0], [0.0], [-3.0]], atol=1e-14)
-    assert task.start["tilt"].shape == (5, 1) and not task.start["tilt"].any()
-
-
 @pytest.mark.parametrize(
     ("steps", "frames", "wanted"),
-    [(0, 1, [0]), (5, 1, [5]), (5, 2, [2, 5]), (6, 3, [2, 4, 6]), (7, 7, [*range(1, 8)]), (100, 4, [25, 50, 75, 100])],
+    [(0, 1, [0]), (5, 2, [2, 5]), (7, 7, [*range(1, 8)]), (100, 4, [25, 50, 75, 100])],
 )
 def test_frames_are_spread_evenly_up_to_the_last(task_file, steps, frames, wanted):
     task = load_task(task_file, [f"problem.steps={steps}", f"problem.frames={frames}"])
@@ -137,22 +123,12 @@ def test_a_picture_needs_no_hidden_parameters(task_file):
     assert task.optimise.check.psnr == 10.0
 
 
-def test_options_of_the_search(task_file):
-    overrides = ["problem.target.viscosity=0.1", "optimise.start.viscosity=0.05", "optimise.bounds.viscosity=[0.01,1]"]
-    overrides += ["optimise.start.gravity=[[0,-7],[0,-8]]", "optimise.bounds.gravity=[[-5,-20],[5,0]]"]
-    task = load_task(task_file, [*overrides, "optimise.knots=2", 'optimise.logarithmic=["viscosity"]'])
-    assert (task.optimise.knots, task.optimise.logarithmic) == (2, ("viscosity",))
-    np.testing.assert_array_equal(task.optimise.bounds["gravity"], [[-5, -20], [5, 0]])
-
-
 SMOOTHING = ['optimise.gradient.name="adjoint_viscosity"']
 SEVERAL = ["optimise.gradient.samples=4", "optimise.gradient.spread.gravity=0.5"]
 STILL = "optimise.gradient.position_noise=0"
 ESTIMATORS = {
     "exact": ([], gradients.Exact()),
-    "smoothing": (SMOOTHING, gradients.AdjointViscosity()),
     "with a coefficient": ([*SMOOTHING, "optimise.gradient.coefficient=3.0"], gradients.AdjointViscosity(3.0)),
-    "averaged": ([*SMOOTHING, *SEVERAL], gradients.EnsembleMean({"gravity": 0.5}, 4)),
     "averaged in place": ([*SMOOTHING, *SEVERAL, STILL], gradients.EnsembleMean({"gravity": 0.5}, 4, 0.0)),
     "averaged without smoothing": (SEVERAL, gradients.EnsembleMean({"gravity": 0.5}, 4, estimator=gradients.Exact())),
 }
@@ -163,21 +139,14 @@ def test_a_gradient_is_chosen_by_name(task_file, overrides, wanted):
     assert load_task(task_file, overrides).optimise.gradient.estimator() == wanted
 
 
-def test_random_values_are_drawn_later(task_file):
-    places = np.full((64, 2), 0.1).tolist()
-    overrides = [f"problem.target={{initial_positions={places}}}", 'optimise.start={initial_positions="random"}']
-    task = load_task(task_file, overrides)
-    assert task.start == {"initial_positions": "random"}
-
-
 FILES = sorted((Path(__file__).parents[1] / "examples").glob("*.toml"))
 EXAMPLES = [path for path in FILES if "[optimise]" in path.read_text("utf-8")]
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_a_task(path):
-    task = load_task(path)
-    assert task.scene.name and task.start.keys() >= (task.optimise.bounds or {}).keys()
+def test_an_example_is_a_task():
+    for path in EXAMPLES:
+        task = load_task(path)
+        assert task.scene.name and task.start.keys() >= (task.optimise.bounds or {}).keys()
 
 
 @pytest.mark.parametrize("old, new, field", [bad[1:] for bad in BAD_TASKS], ids=[bad[0] for bad in BAD_TASKS])
@@ -190,16 +159,10 @@ def test_a_bad_task_is_a_sentence(task_file, old, new, field):
     assert str(caught.value).startswith(f"{task_file}: {field} ")
 
 
-def test_a_missing_file_is_a_sentence(tmp_path):
-    with one_sentence("cannot be read", error=SceneError):
-        load_task(tmp_path / "absent.toml")
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (GOOD_TASK.replace("[problem", "[problems"), r"problems is not a key of the scene; did you mean problem\?"),
-        (GOOD_TASK.replace("[optimise", "[optimises"), r"optimises is not a key of the scene; did you mean optimise\?"),
         (TASK.replace("rotor.turn", "rotor.turns"), r"'rotor\.turns' is unknown, but must be one of .*, rotor\.turn, "),
     ],
 )
@@ -226,11 +189,9 @@ JUDGED = {
     "reached": ([], TRUE, [1.0, 0.25], 0.0, 4.0, []),
     "not reached": ([ASKED, "optimise.check.parameter_error=0.1"], OFF, [3.0, 4.0, 2.0], 0.2, 1.5, NOT_REACHED),
     "no loss": ([], TRUE, [0.0], 0.0, math.inf, []),
-    "no loss any more": ([], TRUE, [1.0, 0.0], 0.0, math.inf, []),
     "distance from a hidden zero": (["problem.target.gravity=[0,0]"], [0.3, 0.4], FELL, 0.5, 4.0, None),
     "target over time": ([f"problem.target.gravity={[[3.0, 4.0]] * 5}"], OFF, FELL, 0.2, 4.0, []),
     "found over time": ([ASKED], [OFF] * 5, FELL, 0.2, 4.0, []),
-    "a target that is not optimised": (["problem.target.viscosity=0.1"], TRUE, FELL, 0.0, 4.0, []),
 }
 
 
@@ -254,21 +215,15 @@ def test_an_image_is_judged_by_its_noise(task_file):
     assert judge(task, reached, noise=math.inf).psnr == math.inf
     missed = "The image is matched to 29.5 dB, but the task asks for 30 dB."
     assert judge(task, reached, noise=29.5).failures == [missed]
+    assert found_in_words(0.004).startswith("found with an error of 0.4%") and found_in_words(0.81)[:9] == "not found"
 
 
-@pytest.mark.parametrize("error, words", [(0.004, "found with an error of 0.4%"), (0.81, "not found, 81% off")])
-def test_what_is_far_off_is_not_called_found(error, words):
-    assert found_in_words(error).startswith(words)
-
-
-@pytest.mark.parametrize(
-    "override", ["optimise.start.mobilty=1", 'optimise.logarithmic=["mobilty"]', "problem.target.mobilty=1"]
-)
-def test_only_parameters_of_the_scene_are_offered(task_file, override):
-    with pytest.raises(SceneError, match="must be one of gravity, tilt, ") as caught:
-        load_task(task_file, [override])
-    said = str(caught.value)
-    assert "viscosity" in said and not any(word in said for word in ("flow_rate", "surface", "mass_fractions", "width"))
+def test_only_parameters_of_the_scene_are_offered(task_file):
+    for override in ("optimise.start.mobilty=1", 'optimise.logarithmic=["mobilty"]', "problem.target.mobilty=1"):
+        with pytest.raises(SceneError, match=r"must be one of gravity, tilt, .*viscosity") as caught:
+            load_task(task_file, [override])
+        unknown = ("flow_rate", "surface", "mass_fractions", "width")
+        assert not any(word in str(caught.value) for word in unknown)
 
 
 def test_a_task_searches_a_path_by_its_knots(task_file):

@@ -14,7 +14,7 @@ from cortado.device.launching import launch
 from cortado.device.modules import kernel_module
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.particles.made_derivatives import made_adjoint, made_tangent
+from cortado.particles.made_derivatives import made_adjoint
 from cortado.particles.moving_walls import WallArrays
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.neighbours import NeighbourSearch
@@ -30,55 +30,26 @@ def untyped(x_ij: vector, c_j) -> real:
     return c_j
 
 
-def texts(x_ij: vector, c_j: "real") -> real:
-    return c_j
-
-
-def hidden(x_ij: vector, _c_j: real) -> real:
-    return _c_j
-
-
 def matrix(x_ij: vector) -> wp.mat33d:
     return wp.outer(x_ij, x_ij)
-
-
-def half(x_ij: vector) -> wp.float32:
-    return wp.float32(1.0)
 
 
 def apart(c_i: real, c_j: real) -> real:
     return c_i * c_j
 
 
-def tangential(x_ij: vector, c_j: real, c_dot_j: real) -> real:
-    return c_j * c_dot_j
-
-
-def fluid(x_ij: vector, c_j: real) -> real:
-    return c_j
-
-
 def other_walls(x_ij: vector, strength: real) -> real:
     return strength
-
-
-def vector_walls(x_ij: vector) -> vector:
-    return x_ij
 
 
 @pytest.mark.parametrize(
     ("make", "term", "message"),
     [
         (fluid_sum(D), untyped, "term untyped has no type at 'c_j', but must have a type at each."),
-        (fluid_sum(D), texts, "term texts has a text at 'c_j', but must have a type at each."),
-        (fluid_sum(D), hidden, "term hidden has '_c_j', but names must not begin with an underscore."),
         (fluid_sum(D), matrix, "but a sum must be of numbers or vectors of the precision."),
-        (fluid_sum(D), half, "but a sum must be of numbers or vectors of the precision."),
         (wall_sum(D), apart, "term apart has no x_ij, but must have it where it is summed over walls."),
-        (pair_sum(D, walls=other_walls), fluid, "term other_walls of walls has strength, but must have"),
-        (pair_sum(D, walls=vector_walls), fluid, "term vector_walls of walls returns"),
+        (pair_sum(D, walls=other_walls), matrix, "term other_walls of walls has strength, but must have"),
         (lambda f: made_adjoint(D, lambda d: f), apart, "term apart has no x_ij, but must have it for derivatives"),
-        (lambda f: made_tangent(D, lambda d: f), tangential, "has a name and the same with _dot, but tangents have"),
     ],
 )
 def test_what_a_term_cannot_be_is_said(make, term, message):
@@ -186,12 +157,6 @@ def test_values_and_derivatives(precision):
     ways[0] = np.repeat(ways[0], PARTICLES)  # shares of a scene's parameter stand at its particles
     backward = sum((back[f"{name}_bar"].numpy() * way).sum() for name, way in zip(names, ways, strict=True))
     assert backward == pytest.approx(forward, rel=tolerance)
-
-
-def test_an_adjoint_may_stand_where_that_of_a_result_stood():
-    kernel = made(FLOAT64, {"moved": "x"}).adjoint
-    assert "moved_bar" not in {argument.label for argument in kernel.adj.args}
-    assert "bar.x[i] = _by_x" in kernel.adj.source and "bar.m[i] = bar.m[i] + _by_m" in kernel.adj.source
 
 
 N, WALLS, SIDE, REACH = 60, 40, 2.3, 1.03
