@@ -249,3 +249,24 @@ def test_a_gravity_is_judged_by_the_limits_of_the_time_step_where_it_is_stronger
     assert not said([0.4, -9.0]) and not said([2.0, -1.0]) and said([0.0, -1e4]) and not said([0.0, -1e4])
     longer = {"steps": 2, "time_step": 0.012}
     assert not said([0.0, -1e-3], **longer) and said(None, **longer)
+
+
+@pytest.mark.parametrize("library", ["jax", "torch"])
+def test_two_loops_in_turn_have_their_own_bits_and_a_changed_state_is_judged(library):
+    layer, simulation = layer_of(library), Simulation(sheared())
+    first, pulls = layer.state(simulation), {"left": -0.4, "right": 0.3}
+
+    def step(own, state, pull, number):
+        return layer.step(own, state, {"gravity": np.array([pull * number, -9.0])})
+
+    ends = dict.fromkeys(pulls, first)
+    for number in range(4):
+        ends |= {side: step(simulation, ends[side], pull, number) for side, pull in pulls.items()}
+    for side, pull in pulls.items():
+        alone, state = Simulation(sheared()), first
+        for number in range(4):
+            state = step(alone, state, pull, number)
+        assert all(np.array_equal(state[name], ends[side][name]) for name in state)
+    end = step(simulation, ends["left"], 0.1, 1)
+    with pytest.raises(InputError, match="outside the container"):
+        step(simulation, {**end, "positions": end["positions"] + 9.0}, 0.1, 1)
