@@ -62,8 +62,6 @@ SHARED = {
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
     "environments.kernels": "of rewards, which are no losses of these scenes: tests/test_environments.py",
-    "particles.pair_sums": "it notes adjoints and has none",
-    "particles.made_derivatives": "it makes them of terms, in texts: tests/test_terms.py",
     "sph.parts.begin_adjoint_kernel.begin_adjoint": "for solvers from outside: tests/test_solver.py",
     "solvers.projection.mean_stress": "of quantities that no loss of these scenes sees: tests/test_energy_budget.py",
 }
