@@ -80,7 +80,7 @@ def test_a_key_that_a_page_sets_is_one():
     assert [key for key in sorted(found) if not re.search(rf"\b{key.rpartition('.')[2]}\b", read)] == []
 
 
-MODULES = (*cortado._MODULES, "environments", "errors", "optimisation.transforms")
+MODULES = (*cortado._MODULES.split(), "environments", "errors", "optimisation.transforms")
 
 
 def test_a_class_that_a_page_names_is_there():

@@ -19,8 +19,7 @@ A first example::
     value, gradient = problem.value_and_gradient({"gravity": [0.5, -9.81], "viscosity": 1.0})
 
 The command ``cortado new dam`` writes a commented scene file, which ``cortado.Simulation("dam.toml")`` reads. The
-command ``cortado schema`` prints all keys with their meanings. Names are imported when they are first used, so ``import
-cortado`` is quick.
+command ``cortado schema`` prints all keys with their meanings. Names are imported when they are first used.
 """
 
 from cortado.lazy import getter
@@ -60,18 +59,7 @@ if TYPE_CHECKING:
     from cortado.simulation import Simulation as Simulation
 
 
-_MODULES = (
-    "executors",
-    "forces",
-    "gradients",
-    "image_losses",
-    "losses",
-    "measured",
-    "optimisers",
-    "pictures",
-    "render",
-    "sensors",
-)
+_MODULES = "executors forces gradients image_losses losses measured optimisers pictures render sensors"
 _NAMES = {
     "certificate": "certify",
     "errors": "ComputationError CortadoError CortadoWarning DivergedError InputError SceneError",
@@ -84,7 +72,7 @@ _NAMES = {
     "simulation": "Simulation",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
-__all__ = [*_MODULES, *_HOMES]
+__all__ = [*_MODULES.split(), *_HOMES]
 
 if not TYPE_CHECKING:  # which would take any name for one of the package
     __getattr__ = getter(__name__, _HOMES)

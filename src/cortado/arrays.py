@@ -10,14 +10,7 @@ import numpy as np
 
 from cortado.errors import InputError, Words, shown
 
-REFUSED = {
-    "c": "complex numbers",
-    "b": "True and False",
-    "U": "text",
-    "S": "text",
-    "M": "dates",
-    "m": "spans of time",
-}
+REFUSED = {"c": "complex numbers", "b": "True and False", "U": "text", "S": "text", "M": "dates", "m": "spans of time"}
 GREATEST_NUMBER = 10**18
 
 
@@ -107,12 +100,10 @@ def require_function(what: str, value: Any, *arguments: str) -> None:
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raise `InputError` if the signature of ``function`` lacks one of the arguments ``wanted``. The error message also
-    mentions the text ``other``."""
+    """Raise `InputError` if ``function`` does not take the arguments ``wanted``. The message mentions ``other``."""
     if not callable(function) or isinstance(function, type):
-        raise InputError(
-            f"{what} is {shown(function)}, but must be a function of {', '.join(wanted) or 'nothing'}{other}."
-        )
+        said = f"{what} is {shown(function)}"
+        raise InputError(f"{said}, but must be a function of {', '.join(wanted) or 'nothing'}{other}.")
     try:
         takes = signature(function)
     except (TypeError, ValueError):
@@ -131,8 +122,7 @@ def require_truth(what: str, value: object) -> None:
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raise `InputError` unless ``value`` is an object with the methods ``names``. The error message ends with
-    ``wanted``."""
+    """Raise `InputError` with ``wanted`` unless ``value`` is an object with the methods ``names``."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 

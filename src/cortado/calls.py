@@ -157,8 +157,7 @@ _OWN = "_made_with"
 
 
 def fixed(made: type[T]) -> type[T]:
-    """Decorate a class so that setting or deleting public attributes after construction raises `InputError`. Derived
-    classes may add attributes."""
+    """Make setting or deleting public attributes of a class raise `InputError`. Derived classes may add attributes."""
     begin: Callable[..., None] = told(made.__init__)
 
     @wraps(begin)
@@ -187,8 +186,6 @@ def fixed(made: type[T]) -> type[T]:
 
 
 class FixedDict(dict[Any, Any]):
-    """An immutable copy of a dict."""
-
     def __reduce__(self) -> tuple[Any, ...]:
         return FixedDict, (dict(self),)
 
@@ -239,8 +236,7 @@ def sized(arrays: Mapping[str, Any]) -> str:
 
 
 class ShortRepr:
-    """A base class for dataclasses with a short ``repr``, which shows only the shapes of arrays. Derived dataclasses
-    need ``repr=False``."""
+    """A base class for dataclasses with only the shapes of arrays in ``repr``. Subclasses need ``repr=False``."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

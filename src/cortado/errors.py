@@ -61,8 +61,7 @@ class SceneError(CortadoError):
     """An error in a scene, with the key, the value found and the value wanted. The exit code is 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """Store the parts of the error message. ``sentence`` replaces the default "is <found>, but must be
-        <wanted>."."""
+        """Store the parts of the error message. ``sentence`` replaces "is <found>, but must be <wanted>" in it."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
         """Path of the scene file as the user gave it, or None for a scene built in Python."""
@@ -88,8 +87,7 @@ class ComputationError(CortadoError):
 
 
 class DivergedError(ComputationError):
-    """An error for a lost particle. A particle is lost if it leaves its container, or if its position is not finite or
-    too far away."""
+    """An error for a lost particle, which left its container, or has a position that is not finite or too far away."""
 
     def __init__(
         self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""
@@ -140,9 +138,9 @@ class EngineMissingError(CortadoError, ImportError):
     """An error if the reference engine is not installed."""
 
     def __str__(self) -> str:
+        compiler = "which needs a C++17 compiler (g++, for all precisions)"
         return (
-            "The reference engine is not installed: in a clone of the repository pip install ./reference, which needs "
-            "a C++17 compiler (g++, for all precisions)."
+            f"The reference engine is not installed: in a clone of the repository pip install ./reference, {compiler}."
         )
 
 
@@ -161,8 +159,7 @@ class LibraryMissingError(CortadoError, ImportError):
     """An error if an optional library is not installed."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
-        """Store the library's ``name``, the ``package`` that contains it, and the ``module`` of Cortado that
-        needs it."""
+        """Store the library's ``name``, the ``package`` that contains it, and Cortado's ``module`` that needs it."""
         super().__init__(name, package, module)
         self.package = package
 

@@ -32,8 +32,7 @@ __all__ = ["Distributed", "Executor", "InProcess", "local_workers"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 OnResult = Callable[[int, Any], None]
-"""A function that is called with the number of an item, from 0, and its result. The caller's thread calls it when a
-result arrives."""
+"""A function that is called in the caller's thread with the number of an item, from 0, and its result."""
 
 
 class Executor(ABC):
@@ -53,8 +52,7 @@ class Executor(ABC):
         """Return the results of ``function`` for all ``items``, in the order of the items. ``on_result`` is called for
         each result.
 
-        Large data, such as a problem, should be part of the function, and items should be small. If items fail, the
-        error of the first failed item is raised.
+        Large data, such as a problem, should be part of the function. The error of the first failed item is raised.
         """
 
 
@@ -86,12 +84,9 @@ def _check_call(function: Any, items: Any, on_result: Any) -> None:
 
 def checked_executor(executor: Any) -> Executor:
     if not isinstance(executor, Executor):
-        is_class = isinstance(executor, type)
+        is_class, wanted = isinstance(executor, type), "cortado.executors.InProcess() or Distributed(scheduler)"
         found = f"the class {executor.__name__}" if is_class else f"of the type {type(executor).__name__}"
-        raise InputError(
-            f"executor is {found}, but must be an object such as cortado.executors.InProcess() or "
-            "Distributed(scheduler)."
-        )
+        raise InputError(f"executor is {found}, but must be an object such as {wanted}.")
     return executor
 
 
@@ -114,12 +109,10 @@ class Distributed(Executor):
     """
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
-        """Connect to ``scheduler``, which is an address such as "tcp://10.0.0.1:8786" or a client. ``patience`` is the
-        waiting time for a worker when all workers are lost [s]. Raises `InputError` if distributed is not installed or
-        if there is no scheduler."""
+        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client. ``patience`` is the waiting
+        time for a worker when all are lost [s]. Raises `InputError` without distributed or a scheduler."""
         module = _distributed()
-        self.patience = patience
-        self._owned = isinstance(scheduler, str)
+        self.patience, self._owned = patience, isinstance(scheduler, str)
         self.client = _connected(module, scheduler) if isinstance(scheduler, str) else scheduler
         if not isinstance(self.client, module.Client) or self.client.asynchronous:
             wanted = 'an address such as "tcp://10.0.0.1:8786", or a distributed.Client that is not asynchronous'
@@ -146,11 +139,9 @@ class Distributed(Executor):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the results of ``function`` for all ``items``; see `Executor.map`. The computation begins as soon as
-        there is a worker. ``on_result`` is called for each result.
+        """Return the results of ``function`` for all ``items``; see `Executor.map`. It begins with the first worker.
 
-        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` without a scheduler or
-        workers.
+        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` without workers.
         """
         _check_call(function, items, on_result)
         return _Map(self, Payload.of(function), on_result).results(items)
@@ -171,10 +162,8 @@ class Distributed(Executor):
         return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
 
     def deserted(self, seconds: float) -> ComputationError:
-        return ComputationError(
-            f"The scheduler {self.address} has had no worker for {seconds:.0f} s; start some, such as by "
-            f"`dask worker {self.address} --nthreads 1`."
-        )
+        said = f"The scheduler {self.address} has had no worker for {seconds:.0f} s"
+        return ComputationError(f"{said}; start some, such as by `dask worker {self.address} --nthreads 1`.")
 
 
 class _Map:
@@ -187,7 +176,6 @@ class _Map:
         self._failed: tuple[int, BaseException] | None = None
         """Number and error of the first failed item."""
         self._name = f"cortado-{uuid4().hex}"
-        self._lost: deque[str] = deque()
         self._most = 0
         self._counted, self._manned = -LOOK, time.monotonic()
         """Time of the last count of workers, and time of the last count above 0 [s]."""
@@ -195,45 +183,37 @@ class _Map:
     def results(self, items: Iterable[Item]) -> list[Any]:
         import dask
 
-        with self._watched(), dask.config.set({"distributed.admin.large-graph-warning-threshold": 2**40}):
-            left = enumerate(items)
-            try:
-                while self._fill(left):
-                    done, _ = wait(self._sent, LOOK, FIRST_COMPLETED)
-                    self._count_workers(LOOK)
-                    self._warn()
-                    for future in done:
-                        if future in self._sent:  # or else given up, as an item before it failed
-                            self._take(future)
-            finally:
-                with suppress(OSError):  # the scheduler may be lost
-                    self._calls.shutdown(wait=False)
-        self._warn()
-        if self._failed is not None:
-            raise self._failed[1]
-        return [self._results[number] for number in range(len(self._results))]
-
-    @contextmanager
-    def _watched(self) -> Iterator[None]:
+        client, lost, left = self._executor.client, deque[str](), enumerate(items)
 
         def hear(event: tuple[float, dict[str, Any]]) -> None:
             _, said = event
             tasks = said.get("processing-tasks", ()) if said.get("action") == "remove-worker" else ()
             if any(str(key).startswith(self._name) for key in tasks):
-                self._lost.append(str(said.get("worker")))
+                lost.append(str(said.get("worker")))
 
-        client = self._executor.client
+        def tell() -> None:
+            while lost:
+                warn(f"The worker {lost.popleft()} was lost; what it was computing is computed again by another one.")
+
         client.subscribe_topic("all", hear)
         try:
-            yield
+            with dask.config.set({"distributed.admin.large-graph-warning-threshold": 2**40}):
+                while self._fill(left):
+                    done, _ = wait(self._sent, LOOK, FIRST_COMPLETED)
+                    self._count_workers(LOOK)
+                    tell()
+                    for future in done:
+                        if future in self._sent:  # or else given up, as an item before it failed
+                            self._take(future)
         finally:
+            with suppress(OSError):  # the scheduler may be lost
+                self._calls.shutdown(wait=False)
             with suppress(ValueError, OSError):
                 client.unsubscribe_topic("all")
-
-    def _warn(self) -> None:
-        while self._lost:
-            worker = self._lost.popleft()
-            warn(f"The worker {worker} was lost; what it was computing is computed again by another one.")
+        tell()
+        if self._failed is not None:
+            raise self._failed[1]
+        return [self._results[number] for number in range(len(self._results))]
 
     def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
         """Send items to workers, unless an item has failed. Return True if a result is still missing."""
@@ -242,14 +222,11 @@ class _Map:
             time.sleep(WAIT)
             self._count_workers(WAIT)
         while len(self._sent) < self._most and self._failed is None and (pair := next(left, None)):
-            number, item = pair
-            self._send(self._payload.mention, number, pickled(item, f"Item {number}"))
+            number, item = pair[0], pickled(pair[1], f"Item {pair[0]}")
+            # The function is no task of its own: items would queue up for the worker that has it while others are idle.
+            sent = self._calls.submit(call, self._payload.mention, item, key=f"{self._name}-{number}")
+            self._sent[sent] = number, item
         return bool(self._sent)
-
-    def _send(self, payload: Payload, number: int, item: bytes) -> None:
-        # The function is no task of its own: items would queue up for the worker that has it while others are idle.
-        key = f"{self._name}-{number}{'-again' * (payload.content is not None)}"
-        self._sent[self._calls.submit(call, payload, item, key=key)] = number, item
 
     def _count_workers(self, interval: float) -> None:
         """Count workers, at most once per interval [s]. Raises `ComputationError` if there are none for too long."""
@@ -265,13 +242,23 @@ class _Map:
             raise self._executor.deserted(now - self._manned)
 
     def _take(self, future: Future[Any]) -> None:
-        """Store the result of a finished call. If the worker does not have the function, send the function to the
-        worker."""
+        """Store the result of a finished call, or send the function to a worker that does not have it."""
         number, item = self._sent.pop(future)
         try:
-            answer = self._answer(future, number)
+            try:
+                answer: Answer | Lacking = future.result()
+            except CancelledError:
+                raise self._executor.lost() from None
+            except _distributed().KilledWorker as error:
+                said = f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost"
+                raise ComputationError(f"{said} while they computed it: they may have too little memory.") from None
+            except Exception as error:  # of distributed itself, such as a worker without Cortado
+                said = f"Item {number} could not be computed by a worker: {in_words(error)}."
+                raise ComputationError(said) from error
             if isinstance(answer, Lacking):
-                return self._send(self._payload, number, item)
+                again = self._calls.submit(call, self._payload, item, key=f"{self._name}-{number}-again")
+                self._sent[again] = number, item
+                return
             self._results[number] = answer.result()
         except Exception as error:
             if self._failed is None or number < self._failed[0]:
@@ -283,29 +270,13 @@ class _Map:
         if self._on_result is not None:
             self._on_result(number, self._results[number])
 
-    def _answer(self, future: Future[Any], number: int) -> Answer | Lacking:
-        try:
-            answer = future.result()
-        except CancelledError:
-            raise self._executor.lost() from None
-        except _distributed().KilledWorker as error:
-            raise ComputationError(
-                f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost while they "
-                "computed it: they may have too little memory."
-            ) from None
-        except Exception as error:  # of distributed itself, such as a worker without Cortado
-            raise ComputationError(f"Item {number} could not be computed by a worker: {in_words(error)}.") from error
-        assert isinstance(answer, (Answer, Lacking))
-        return answer
-
 
 def _distributed() -> Any:
     try:
         import distributed
     except ModuleNotFoundError:
-        raise InputError(
-            "Several processes need Dask's distributed, which is not installed: pip install distributed."
-        ) from None
+        said = "Several processes need Dask's distributed, which is not installed"
+        raise InputError(f"{said}: pip install distributed.") from None
     return distributed
 
 
@@ -323,9 +294,8 @@ def _connected(module: Any, address: str) -> Any:
             thread.submit(asyncio.run, meet()).result()
         except (OSError, ValueError, TypeError) as error:
             reason = f"no scheduler answers there within {REACHED:g} s" if isinstance(error, OSError) else error
-            raise InputError(
-                f"There is no scheduler at {address!r}, but an address such as tcp://10.0.0.1:8786 is needed: {reason}."
-            ) from None
+            said = f"There is no scheduler at {address!r}, but an address such as tcp://10.0.0.1:8786 is needed"
+            raise InputError(f"{said}: {reason}.") from None
     return module.Client(address, timeout=REACHED, set_as_default=False)
 
 
@@ -352,16 +322,13 @@ class LocalWorkers(Distributed):
         self._cluster.scale(len(self._cluster.worker_spec))
 
     def deserted(self, seconds: float) -> ComputationError:
-        return ComputationError(
-            f"No worker process has started for {seconds:.0f} s; there may be too little memory for it, or the script "
-            'does not begin under `if __name__ == "__main__":`.'
-        )
+        why = 'there may be too little memory for it, or the script does not begin under `if __name__ == "__main__":`'
+        return ComputationError(f"No worker process has started for {seconds:.0f} s; {why}.")
 
 
 @contextmanager
 def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
-    """Start worker processes on this machine, and a scheduler in this process. The scheduler restarts lost workers. The
-    processes end at the end of the ``with`` block.
+    """Start worker processes on this machine, until the end of the ``with`` block. Lost workers are started again.
 
     ``number`` is the number of processes, by default one for each core, or one for each GPU with the ``device`` "cuda".
     On GPUs each process sees one GPU as "cuda:0". Every process imports the script. The code of the script must
@@ -374,13 +341,10 @@ def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Di
     import dask
 
     module = _distributed()
-    environments = _environments(number, device)
     options: dict[str, Any] = {"nthreads": 1, "memory_limit": None, "silence_logs": logging.CRITICAL, "host": LOOPBACK}
     options["preload"] = [IGNORE_INTERRUPTS]
-    workers = {
-        name: {"cls": module.Nanny, "options": {**options, "env": variables}}
-        for name, variables in enumerate(environments)
-    }
+    each = enumerate(_environments(number, device))
+    workers = {name: {"cls": module.Nanny, "options": {**options, "env": own}} for name, own in each}
     somewhere = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0", "dashboard": False}
     scheduler = {"cls": module.Scheduler, "options": somewhere}
     hold = Hold()
@@ -414,16 +378,13 @@ def _environments(number: int | None, device: str) -> list[dict[str, str]]:
 
 
 def require_processes(what: str, number: object) -> None:
-    """Raise `InputError` unless ``number`` is a possible number of processes. The error message begins with
-    ``what``."""
+    """Raise `InputError` unless ``number`` is a possible number of processes. Its message begins with ``what``."""
     require_whole(what, number, 1)
     cores = usable_cores()
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)
     if number > most:  # type: ignore[operator]
-        raise InputError(
-            f"{what} is {shown(number)}, but must be at most {most}, as this machine has {counted(cores, 'core')}: "
-            "more processes than cores are no faster."
-        )
+        said = f"{what} is {shown(number)}, but must be at most {most}, as this machine has {counted(cores, 'core')}"
+        raise InputError(f"{said}: more processes than cores are no faster.")
 
 
 __dir__ = face(globals())

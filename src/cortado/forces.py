@@ -1,5 +1,4 @@
-"""User-defined forces, made from a function, for ``Simulation(scene, forces=[...])``. `docs/own_parts.md` has
-examples."""
+"""User-defined forces, made from a function, for ``Simulation(scene, forces=[...])``; see `docs/own_parts.md`."""
 
 from cortado.calls import face
 from cortado.sph.own_force import Body, OverTime, Pair, Rheology

@@ -57,24 +57,20 @@ class SquaredDifference:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """An image loss: the weighted mean squared difference, summed over the levels of a Gaussian pyramid (Burt and
-    Adelson 1983).
+    """An image loss: the weighted mean squared differences of the levels of a Gaussian pyramid (Burt and Adelson 1983).
 
     The first level is the image. Each further level is the previous level, blurred and halved in size. Coarse levels
     locate a shape before it overlaps its target, and fine levels compare outlines.
 
-    ``levels`` is the number of levels. ``weights`` has one number for each level, by default 1, 2, 4 ... from fine to
-    coarse levels.
+    ``levels`` is the number of levels. ``weights`` has a number for each, by default 1, 2, 4 ... from fine to coarse.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """Number of levels. If None, it is the number of weights. Without weights, the coarsest level has sides of at most
-    2 pixels."""
+    """Number of levels, by default that of the weights. Without weights the coarsest level has sides of 1 or 2."""
     weights: tuple[float, ...] | None = None
-    """Weights of the levels (levels,) from fine to coarse. They should increase, because blurring makes shapes
-    fainter."""
+    """Weights of the levels (levels,) from fine to coarse. They should increase, as blurring makes shapes fainter."""
 
     def __post_init__(self) -> None:
         if self.levels is not None:
@@ -96,29 +92,22 @@ class Pyramid:
         return f"pyramid, levels {self.levels}, weights {self.weights}"
 
     def value(self, image: ArrayLike, target: ArrayLike) -> float:
-        levels = self._levels(_difference(image, target))
-        weights = self._weights(levels)
-        return sum(weight * float(np.mean(level**2)) for weight, level in zip(weights, levels, strict=True))
+        return sum(weight * float(np.mean(level**2)) for weight, level in self._weighted_levels(image, target))
 
     def adjoint(self, image: ArrayLike, target: ArrayLike) -> Image:
-        levels = self._levels(_difference(image, target))
-        weights = self._weights(levels)
-        bar = np.zeros_like(levels[-1])
-        for k in reversed(range(len(levels))):
-            if k < len(levels) - 1:
-                bar = reduce_transposed(bar, levels[k].shape[:2])
-            bar += 2.0 * weights[k] / levels[k].size * levels[k]
+        bar = None
+        for weight, level in reversed(self._weighted_levels(image, target)):
+            bar = np.zeros_like(level) if bar is None else reduce_transposed(bar, level.shape[:2])
+            bar += 2.0 * weight / level.size * level
+        assert bar is not None
         return bar
 
-    def _levels(self, difference: Image) -> list[Image]:
+    def _weighted_levels(self, image: ArrayLike, target: ArrayLike) -> list[tuple[float, Image]]:
         wanted = self.levels or (len(self.weights) if self.weights else None)
-        levels = [difference]
+        levels = [_difference(image, target)]
         while len(levels) < wanted if wanted else max(levels[-1].shape[:2]) > SMALLEST:
             levels.append(reduce(levels[-1]))
-        return levels
-
-    def _weights(self, levels: list[Image]) -> tuple[float, ...]:
-        return self.weights or tuple(2.0**k for k in range(len(levels)))
+        return list(zip(self.weights or [2.0**k for k in range(len(levels))], levels, strict=True))
 
 
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
@@ -134,13 +123,11 @@ def psnr(image: ArrayLike, target: ArrayLike) -> float:
 
 def reduce(image: Image) -> Image:
     """Return the next coarser level of a Gaussian pyramid (ceil(rows / 2), ceil(columns / 2), 3)."""
-    rows, columns = image.shape[:2]
-    return _along_columns(_along_rows(image, reduction(rows)), reduction(columns))
+    return _along_columns(_along_rows(image, reduction(image.shape[0])), reduction(image.shape[1]))
 
 
 def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
-    """Return the adjoint of an image (rows, columns), given the adjoint of the next coarser level. This is the
-    transpose of `reduce`."""
+    """Return the adjoint of an image (rows, columns) for that of the next coarser level: the transpose of `reduce`."""
     rows, columns = shape
     return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
 
@@ -150,8 +137,7 @@ def reduction(size: int) -> Any:
     """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every second pixel.
 
     For an odd size, Burt and Adelson's weights 1 4 6 4 1 are centred on every second pixel, beginning with the first.
-    For an even size, the weights are 1 3 3 1. At an edge the weights are normalised, so that a constant image remains
-    constant.
+    For an even size, the weights are 1 3 3 1. At an edge the weights are normalised: a constant image remains constant.
     """
     from scipy.sparse import csr_array
 

@@ -1,11 +1,9 @@
 """Cortado as a layer of JAX. `docs/layers.md` has examples.
 
-States are dictionaries of arrays by field name, in the simulation's precision, including the ``time`` [s]. Parameters
-are dictionaries with the names of `Problem`.
+States are dictionaries of arrays by field name, with the ``time`` [s]. Parameters have the names of `Problem`.
 
 All functions are differentiable in forward and reverse mode, run as batches under `jax.vmap`, and work inside `jax.jit`
-and `jax.lax.scan`. Second derivatives raise an error. In compiled programs Cortado's error message is part of JAX's
-error message.
+and `jax.lax.scan`. Second derivatives raise an error. In compiled programs JAX's error message contains Cortado's.
 """
 
 from cortado.calls import face

@@ -1,7 +1,6 @@
 """Import names when they are first used, so that ``import cortado`` is quick.
 
-Cortado's core does not import packages such as pictures and exports. A method of the core, such as `Trajectory.film`,
-imports a function of a package by name with `on_top`.
+Cortado's core does not import packages such as pictures. Its methods, such as `Trajectory.film`, use `on_top`.
 """
 
 import importlib

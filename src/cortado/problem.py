@@ -19,7 +19,7 @@ from cortado.losses.loss import moment_of, slope
 from cortado.losses.run_losses import LossesByStep
 from cortado.particles.state import State
 from cortado.rollout.checkpoints import MEMORY_BUDGET
-from cortado.rollout.device_states import OfLost, without_lost
+from cortado.rollout.device_states import without_lost
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Residual, Rollout
 from cortado.rollout.run_checks import one_for_each
@@ -56,12 +56,8 @@ class ProblemForwardPass(Staying):
     _derivatives: BackwardSteps
 
     @property
-    def rollout(self) -> Rollout:
-        return self._residual.rollout
-
-    @property
     def turn(self) -> Turn:
-        return self.rollout.turn
+        return self._residual.rollout.turn
 
     @in_turn
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
@@ -70,40 +66,34 @@ class ProblemForwardPass(Staying):
         ``observe`` is called with the number and the adjoint of every state, from the last to the first. Raises
         `InputError` if the estimator's settings can change, or if it may mix scenes of a batch.
         """
-        derivative = self._derivatives.of(estimator)
-        return self._gradient(derivative, self._first_adjoint(derivative, observe))
+        return self._backward(self._derivatives.of(estimator), observe)[1]
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
         """Return the gradient computed by an ``estimator``, and the derivatives with respect to the first state. The
         derivatives are a table with the names of the state's fields and ``time``."""
         derivative = self._derivatives.of(estimator)
-        first = self._first_adjoint(derivative)
-        initial_state = self._space.state_adjoint(self.rollout, self._values, first, derivative.parameters())
-        return self._gradient(derivative, first), without_lost(self._lost, initial_state)
+        first, gradient = self._backward(derivative)
+        rollout = self._residual.rollout
+        initial_state = self._space.state_adjoint(rollout, self._values, first, derivative.parameters())
+        return gradient, without_lost(dict.fromkeys(rollout.lost, np.nan), initial_state)
 
-    @property
-    def _lost(self) -> OfLost:
-        return dict.fromkeys(self.rollout.lost, np.nan)
-
-    def _first_adjoint(self, derivative: BackwardStep, observe: Observer | None = None) -> State:
+    def _backward(self, derivative: BackwardStep, observe: Observer | None = None) -> tuple[State, Arrays]:
+        """Return the adjoint of the first state, and the gradient."""
         self._residual.bring_back()
-        first = self.rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
+        rollout = self._residual.rollout
+        first = rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
         total = derivative.parameters()
         for own in (bar.step for bar in self._bars.values() if bar.step is not None):
             for name, bar in own.parameters.items():
                 whole = total[name].numpy()
-                add_to_row(self.rollout, name, bar, own.row, whole)
+                add_to_row(rollout, name, bar, own.row, whole)
                 total[name].assign(whole)
-        return first
-
-    def _gradient(self, derivative: BackwardStep, first: State) -> Arrays:
-        bars, values = self._bars, self._values
-        gradient = self._space.gradient(self.rollout, values, first, derivative.parameters())
-        if "colours" in values:
-            gradient["colours"] = np.sum([bar.colours for bar in bars.values()], axis=0)
-        gradient = without_lost(self._lost, gradient)
-        return {name: gradient[name] for name in values}
+        gradient = self._space.gradient(rollout, self._values, first, derivative.parameters())
+        if "colours" in self._values:
+            gradient["colours"] = np.sum([bar.colours for bar in self._bars.values()], axis=0)
+        gradient = without_lost(dict.fromkeys(rollout.lost, np.nan), gradient)
+        return first, {name: gradient[name] for name in self._values}
 
 
 @public
@@ -179,8 +169,7 @@ class Problem:
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """Return the loss at ``parameters``: a number, or an array (batch,) for a batch. The loss of scenes in ``lost``
-        is NaN."""
+        """Return the loss at ``parameters``: a number, or (batch,) for a batch, with NaN for scenes in ``lost``."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
@@ -189,8 +178,7 @@ class Problem:
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """Return states of a run with ``parameters``, by the number of steps before the state. ``steps`` are the wanted
-        numbers, and 0 is the first state."""
+        """Return states of a run with ``parameters``, by their numbers of ``steps``; 0 is the first state."""
         return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
@@ -209,8 +197,7 @@ class Problem:
     def value_and_gradients(
         self, parameters: Values, gradient: AdjointEstimator | None = None
     ) -> tuple[Any, Arrays, Arrays]:
-        """Return the loss, its derivatives with respect to ``parameters``, and its derivatives with respect to the
-        first state.
+        """Return the loss and its derivatives with respect to ``parameters`` and with respect to the first state.
 
         The loss and its derivatives with respect to parameters are as in `value_and_gradient`. The derivatives with
         respect to the state are a table of float64 arrays by field name, with ``time``. For a batch, each array has a
@@ -223,8 +210,7 @@ class Problem:
     def estimate(
         self, parameters: Values, gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Return the loss, its derivatives, and the report of the estimator ``gradient`` (by default
-        `gradients.Exact`).
+        """Return the loss, its derivatives, and the report of the estimator ``gradient``, by default `Exact`.
 
         Estimators with a backward pass call ``observe`` with the number and the adjoint of every state, from the last
         to the first. `gradients.AdjointNorms` is an example of ``observe``.
@@ -234,16 +220,14 @@ class Problem:
         kept = slice(None) if self._going is None else self._going
         broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]
         if broken:
-            warn(
-                f"the gradient with respect to {', '.join(broken)} is not finite, as it grew beyond what "
-                f"{self.simulation.precision.name} holds: try fewer steps, float64, or an estimator for long runs."
-            )
+            grew = f"is not finite, as it grew beyond what {self.simulation.precision.name} holds"
+            advice = "try fewer steps, float64, or an estimator for long runs"
+            warn(f"the gradient with respect to {', '.join(broken)} {grew}: {advice}.")
         return found
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Run forward and return the run, for later backward passes. The returned object keeps the stored states in
-        memory."""
+        """Run forward and return the run, for later backward passes. It keeps the stored states in memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -253,8 +237,7 @@ class Problem:
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
-        """Return the derivative of the loss along ``directions``, by forward mode: a number, or an array (batch,) for a
-        batch. ``directions`` maps names of parameters to tangents."""
+        """Return the derivative of the loss along ``directions``, tangents by name, by forward mode, as in `value`."""
         dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
@@ -313,8 +296,7 @@ class Problem:
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return the greatest number of points for one call of `together` with an ``estimator``; see
-        `Batchable.room`."""
+        """Return the greatest number of points for `together` with an ``estimator``; see `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -327,8 +309,7 @@ class Problem:
         require_points(points)
         if estimator is not None:
             checked_reverse(estimator)
-        problem = self.batch_of(len(points))
-        known = self.simulation.known
+        problem, known = self.batch_of(len(points)), self.simulation.known
         over_time = {n for n in points[0] if n in known.over_time and np.ndim(points[0][n]) == known[n].rank}
         rows = [{name: [value] if name in over_time else value for name, value in point.items()} for point in points]
         values = {name: np.stack([np.asarray(row[name], dtype=np.float64) for row in rows]) for name in points[0]}
@@ -349,9 +330,9 @@ class Problem:
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))
-            self._batches[size] = Problem(
-                self.simulation.batch_of(size), self.steps, self.loss, self.memory_budget, self._states * size or None
-            )
+            states = self._states * size or None
+            batch = self.simulation.batch_of(size), self.steps, self.loss, self.memory_budget, states
+            self._batches[size] = Problem(*batch)
         return self._batches[size]
 
     @property
@@ -384,8 +365,7 @@ class Problem:
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics (steps,) of the last evaluation, by name, such as ``converged``. The names depend on the
-        solver."""
+        """Diagnostics (steps,) of the last evaluation by name, such as ``converged``. Names depend on the solver."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:

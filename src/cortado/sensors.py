@@ -6,16 +6,7 @@ from cortado.runs.probes import FlowRate, PressureProbe, SolidLoad, WallForce
 from cortado.runs.sensor import Readings, Sensor
 from cortado.runs.wave_gauge import WaveGauge
 
-__all__ = [
-    "BodyMotion",
-    "FlowRate",
-    "PressureProbe",
-    "Readings",
-    "Sensor",
-    "SolidLoad",
-    "SpringForce",
-    "WallForce",
-    "WaveGauge",
-]
+__all__ = ["BodyMotion", "FlowRate", "PressureProbe", "Readings", "Sensor", "SolidLoad", "SpringForce", "WallForce"]
+__all__ += ["WaveGauge"]
 
 __dir__ = face(globals())

@@ -55,8 +55,7 @@ Start = RestartState | Sequence[RestartState]
 class Simulation(Stepping):
     """A scene prepared to run.
 
-    Only one thread at a time may use a simulation. A simulation can be pickled and used after a fork; see
-    `docs/processes.md`.
+    One thread at a time may use a simulation. It can be pickled and used after a fork; see `docs/processes.md`.
 
     Example::
 
@@ -104,8 +103,7 @@ class Simulation(Stepping):
         self.own_solver = None if self._given[1] is None and scene.solver.kind in OWN else self._maker
         self._called, self._lanes = build.called(scene.solver, self._given[1]), checked_lanes(lanes)
         self.known = build.known_of(self.forces, self._maker, scene)
-        self.device = device_named(device)
-        self.precision = precision_named(precision)
+        self.device, self.precision = device_named(device), precision_named(precision)
         discrete = discretise(scene)
         room = build.first_capacity(scene.discretisation.support, scene.dimension)
         counts = (self.batch or 1) * len(discrete.fluid.positions), len(discrete.walls.positions)
@@ -122,8 +120,7 @@ class Simulation(Stepping):
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """Positions of wall particles (b, d) [m], and numbers of their solids from `wall_numbers` (b,); -1 for the
-        container."""
+        """Positions of wall particles (b, d) [m], and `wall_numbers` of their solids (b,), or -1 for the container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
         """Constants of the rest lattice, and initial and prescribed masses of the fluid [kg]."""
         self.free_particles = discrete.fluid.emitted.start
@@ -140,8 +137,7 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver if its states have additional fields, else None. Only this solver can continue from these
-        states."""
+        """Name of the solver if only it can continue from its states, which have additional fields, else None."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -198,8 +194,7 @@ class Simulation(Stepping):
             time: duration [s] in place of ``steps``. The run ends with the first step that ends at this time or
                 later.
 
-        Warns if the pressure did not converge. If a particle is lost, a single run raises `DivergedError`. A batch
-        warns and continues without the scene that lost a particle.
+        Warns if the pressure did not converge, and if a scene of a batch is lost. A single run raises `DivergedError`.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one
@@ -230,13 +225,14 @@ class Simulation(Stepping):
         require(parts, "take a larger record_every or fewer steps")
         watch = Watch(self, rollout, record, sensors)
         steps, frames = list[int](), Table(expected)
+        changing = [field.name for field in self.initial.fields if not field.is_constant]
 
         def record_frame(step: int, state: State) -> None:
             steps.append(step)
-            frames.add({**state.views(self.dimension, self._changing), **watch.frame(step, state)})
+            frames.add({**state.views(self.dimension, changing), **watch.frame(step, state)})
 
         record_frame(0, rollout.initial)
-        watch.first()
+        watch.read(0, rollout.initial)
         last = watch.run(lambda step: step % record_every == 0 or rollout.is_last(step), record_frame, observe)
         for sentence in trouble(rollout, self.scene):
             warn(sentence)
@@ -248,11 +244,7 @@ class Simulation(Stepping):
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
         """Return the fields of a ``state`` that steps change."""
-        return state.numpy(self.dimension, self._changing)
-
-    @property
-    def _changing(self) -> list[str]:
-        return [field.name for field in self.initial.fields if not field.is_constant]
+        return state.numpy(self.dimension, [field.name for field in self.initial.fields if not field.is_constant])
 
     def numbers_in_frame(self, components: int) -> int:
         """Return the count of numbers in a `frame`, where each vector has ``components`` components."""
@@ -268,16 +260,14 @@ class Simulation(Stepping):
     def rollout(
         self, steps: int | None = None, controls: Controls = None, state: Start | None = None, time: float | None = None
     ) -> Rollout:
-        """Return a rollout of ``steps`` steps, or of a ``time`` [s]. It starts at ``state``, by default at the initial
-        state of the scene. ``controls`` are as in `run`."""
+        """Return a rollout of ``steps`` steps, or of a ``time`` [s], from ``state``, with ``controls`` as in `run`."""
         rollout = Rollout(self.solver, steps_of_run(self, steps, time, {} if controls is None else controls))
         self._begin(rollout, controls, state, time)
         return rollout
 
     def _begin(self, rollout: Rollout, controls: Controls, state: Start | None, time: float | None) -> None:
         space, given = ParameterSpace(self, rollout.steps), {} if controls is None else controls
-        values = space.checked(given)
-        states = one_for_each(state, self.batch)
+        values, states = space.checked(given), one_for_each(state, self.batch)
         space.check_restarts(states, values)
         space.begin(rollout, values, states=states)
         end_after(rollout, time)
@@ -331,8 +321,7 @@ class Simulation(Stepping):
 
     def renderer(self, **settings: Any) -> Renderer:
         """Return a differentiable renderer of this simulation: ``renderer.render(trajectory[k])`` returns a picture.
-        The scene's table ``[render]`` sets the view. By default the camera looks down from above, and in 2-D at the
-        plane.
+        The scene's table ``[render]`` sets the view. By default the camera looks from above, and in 2-D at the plane.
 
         ``settings`` replace keys of ``[render]``: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
         look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for invalid settings.
@@ -386,8 +375,7 @@ class Simulation(Stepping):
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """Return the value of every parameter of `Problem` in the scene and its forces. The schedule of the scene is
-        ignored."""
+        """Return the values of all parameters of `Problem` in the scene and its forces, without the schedule."""
         return scene_values(self, self.known)
 
     def substeps(
@@ -408,8 +396,7 @@ class Simulation(Stepping):
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
     simulation = Simulation(*made_of)
     if simulation._points != points:
-        raise InputError(
-            "The first positions of a simulation are others than when it was pickled, but must be the same: the file "
-            "of points that its scene names has changed. Restore it, or make the simulation anew."
-        )
+        found = "The first positions of a simulation are others than when it was pickled, but must be the same"
+        why = "the file of points that its scene names has changed"
+        raise InputError(f"{found}: {why}. Restore it, or make the simulation anew.")
     return simulation

@@ -32,8 +32,7 @@ value = bound(user_functions.value, _BRIDGE, __name__)
 
 
 class Steps(torch.nn.Module):
-    """A PyTorch module that runs ``steps`` steps of a simulation. Its parameters are trained parameters of the
-    simulation."""
+    """A PyTorch module that runs ``steps`` steps of a simulation, with trained parameters of the simulation."""
 
     def __init__(
         self,
@@ -42,26 +41,21 @@ class Steps(torch.nn.Module):
         trained: Values | None = None,
         gradient: AdjointEstimator | None = None,
     ):
-        """Make the module. ``trained`` are the initial values of the trained parameters by name, such as
-        ``{"viscosity": 0.1}``. ``gradient`` is as in `step`."""
+        """Make the module. ``trained`` are first values, as in ``{"viscosity": 0.1}``. ``gradient`` is as in `step`."""
         super().__init__()
         layer = user_functions.steps_layer(simulation, steps, gradient)
         self.simulation, self.steps, self.gradient = simulation, steps, gradient
         made = {name: _BRIDGE.array(f"parameter {name}", value, layer) for name, value in (trained or {}).items()}
-        self.trained = torch.nn.ParameterDict({_key(name): torch.nn.Parameter(own) for name, own in made.items()})
-        self._names = tuple(made)
+        trained_by_key = {name.replace(".", "/"): torch.nn.Parameter(own) for name, own in made.items()}
+        self.trained, self._names = torch.nn.ParameterDict(trained_by_key), tuple(made)
 
     def forward(self, given: Tensors, parameters: Tensors | None = None) -> dict[str, "torch.Tensor"]:
         """Return the state after the steps. ``parameters`` are additional parameters, which are not trained."""
-        own = {name: self.trained[_key(name)] for name in self._names}
+        own = {name: self.trained[name.replace(".", "/")] for name in self._names}
         for name in parameters or {}:
             if name in own:
                 raise InputError(f"parameter {name} is given, but must be left out, as the module has its own.")
         return step(self.simulation, given, {**own, **(parameters or {})}, self.steps, self.gradient)
-
-
-def _key(name: str) -> str:
-    return name.replace(".", "/")
 
 
 __dir__ = face(globals())

@@ -21,14 +21,12 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
 class Watch:
-    """An observer of a rollout that records quantities and reads sensors. User-defined sensors and quantities use the
-    arrays of a second solver of the scene."""
+    """Records quantities and reads sensors of a rollout, user-defined ones with the arrays of a second solver."""
 
     def __init__(
         self, simulation: Any, rollout: Rollout, record: Iterable[str] = (), sensors: Mapping[str, Sensor] | None = None
     ):
-        """Watch a rollout of a `Simulation`. Raise `InputError` for unknown quantities, and for a batch with
-        user-defined sensors."""
+        """Watch a rollout of a `Simulation`. Raises `InputError` for unknown quantities, or own sensors in a batch."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
 
@@ -45,7 +43,7 @@ class Watch:
         self.names = tuple(dict.fromkeys(check_quantity(name, "record") for name in names))
         if self.names:
             evaluator()
-        self._logs = [SensorLog(known, simulation.dimension) for _ in range(simulation.batch or 1)]
+        self.logs = [SensorLog(known, simulation.dimension) for _ in range(simulation.batch or 1)]
         self._rollout, self._simulation, self._evaluator = rollout, simulation, evaluator
         self._on_host = {name: one for name, one in known.items() if type(one) not in SENSORS.values()}
         if self._on_host and simulation.batch is not None:
@@ -53,7 +51,7 @@ class Watch:
             wanted = "sensors of a batch must be those of cortado.sensors: read one scene's"
             raise InputError(f"sensors has {type(own).__name__} as {name!r}, but {wanted}.")
         summed: Any = {name: one for name, one in known.items() if name not in self._on_host}
-        self._reader = StepReader(simulation.evaluator(), rollout, summed, self._logs) if summed else None
+        self._reader = StepReader(simulation.evaluator(), rollout, summed, self.logs) if summed else None
         self._quantities = set[str](() if self._reader is None else self._reader.quantities)
         self._colours = np.array([phase.colour for phase in simulation.scene.phase])
         self._waiting: Any = None
@@ -67,7 +65,7 @@ class Watch:
         def look(step: int, state: State) -> None:
             if is_frame(step):
                 record(step, state)
-            self._step(step, state)
+            self.read(step, state)
 
         def keep(step: int, state: State) -> None:
             if self._on_host or is_frame(step):
@@ -77,10 +75,9 @@ class Watch:
 
         self._waiting = Waiting(look, self._rollout.initial, self._rollout.copies)
         try:
-            last = self._rollout.forward(keep, keep=False, meanwhile=self.look, reader=self._reader)
+            return self._rollout.forward(keep, keep=False, meanwhile=self.look, reader=self._reader)
         finally:
             self.look()
-        return last
 
     def look(self) -> None:
         if self._waiting is not None:
@@ -88,12 +85,8 @@ class Watch:
         if self._reader is not None:
             self._reader.look()
 
-    def first(self) -> None:
-        self._step(0, self._rollout.initial)
-
     def frame(self, step: int, state: State) -> Arrays:
-        """Return the recorded quantities of the state after ``step`` steps. They are NaN if the next step loses a
-        particle."""
+        """Return the recorded quantities after ``step`` steps. They are NaN if the next step loses a particle."""
         if not self.names:
             return {}
         found, real = dict[str, NDArray](), self._rollout.solver.discretisation.precision.numpy
@@ -106,38 +99,30 @@ class Watch:
                 found[name] = np.full(sizes, np.nan, dtype=real)
         return found
 
-    def _step(self, step: int, state: State) -> None:
+    def read(self, step: int, state: State) -> None:
+        """Read user-defined sensors."""
         if self._on_host:
             at: Any = self._snapshot(step, state, self._evaluator)
             for name, sensor in self._on_host.items():
-                self._logs[0].read(name, step, partial(value_of, sensor, at))
+                self.logs[0].read(name, step, partial(value_of, sensor, at))
 
     def end(self, state: State) -> None:
         if self._reader is None:
             return
         step = self._rollout.taken
         at = self._snapshot(step, state, self._simulation.evaluator)
-        for member, log in enumerate(self._logs):
+        for member, log in enumerate(self.logs):
             own = at if isinstance(at, Snapshot) else at[member]
             for name, sensor in self._reader.sensors.items() if member not in self._rollout.lost else ():
                 log.read(name, step, partial(value_of, sensor, own))
 
-    def _snapshot(
-        self, step: int, state: State, evaluator: Callable[[], QuantityEvaluator]
-    ) -> Snapshot | SnapshotBatch:
+    def _snapshot(self, step: int, state: State, evaluator: Callable[[], QuantityEvaluator]) -> Any:
         moment = Moment.of(self._rollout, step, state, evaluator, self._quantities)
         d, batch = self._simulation.dimension, self._simulation.batch
         if batch is None:
             return Snapshot(state, d, self._colours, moment)
         return SnapshotBatch(state, d, np.array([self._colours] * batch), moment)
 
-    def known(self, readings: Mapping[str, Readings]) -> float:
-        return self._logs[0].known(readings)
-
-    def go_on(self, steps: int, readings: Mapping[str, Readings]) -> None:
-        """Take over the ``readings`` of an earlier process. ``steps`` is the number of steps of the earlier process."""
-        self._logs[0].go_on(steps, readings)
-
     def readings(self, member: int = 0) -> dict[str, Readings]:
         clock, steps = self._rollout.clocks[member], np.arange(self._rollout.steps + 1)
-        return self._logs[member].readings(clock.times(steps, float(self._rollout.time_steps[member])))
+        return self.logs[member].readings(clock.times(steps, float(self._rollout.time_steps[member])))

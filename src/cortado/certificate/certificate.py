@@ -1,7 +1,6 @@
-"""The certificate of a problem's gradients. It says whether the gradients are right, up to which step they are useful,
-and which estimator suits longer runs."""
+"""Certificates say whether gradients are right, up to which step they are useful, and what suits longer runs."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from html import escape
 from io import StringIO
@@ -13,15 +12,7 @@ import numpy as np
 
 from cortado.arrays import as_one_number, require_whole
 from cortado.calls import counted, public
-from cortado.certificate.consistency import (
-    Consistency,
-    LossHistory,
-    balanced,
-    check_consistency,
-    first_rows,
-    in_float64,
-    up_to,
-)
+from cortado.certificate.consistency import Consistency, LossHistory, check_consistency, first_rows, in_float64, up_to
 from cortado.certificate.horizon import (
     PERTURBATION,
     Alignment,
@@ -55,8 +46,7 @@ ROUGHLY = 0.1
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: whether the adjoint is right, for how many steps it is useful, and which estimator to
-    use."""
+    """The result of `certify`: whether the adjoint is right, for how many steps it is useful, and what to use."""
 
     particles: int
     steps: int
@@ -66,8 +56,7 @@ class Certificate:
     loss_changes: dict[str, float]
     """Predicted change of the loss for a meaningful perturbation of each parameter."""
     consistency: Consistency
-    """Comparison of the derivatives by reverse mode, forward mode and finite differences, for all parameters
-    together."""
+    """Comparison of the derivatives by reverse mode, forward mode and differences, for all parameters together."""
     wrong: tuple[str, ...]
     """Names of the parameters with a wrong derivative. Empty if all derivatives are right."""
     norms: np.ndarray
@@ -79,8 +68,7 @@ class Certificate:
     alignment: Alignment | None
     """Comparison of each estimator's gradient with the smoothed gradient, or None without a smoothed gradient."""
     beside: Consistency | None = None
-    """Comparison of the derivatives after small random moves of the particles. None unless the loss has a corner at the
-    initial state."""
+    """Comparison after small random moves of the particles. None unless the first state is on a corner."""
     beyond: tuple[str, ...] = ()
     """Sentences on questions that remain open because a particle was lost."""
 
@@ -92,7 +80,12 @@ class Certificate:
     def __str__(self) -> str:
         """Return the certificate as tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
-        lines = [size, _table(["parameter", "slope times a perturbation", "adjoint"], self._changes())]
+        tried, changes, spread = {one.parameter for one in self.horizons if one.lasts}, [], ""
+        for name, share in self.loss_changes.items():
+            verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
+            extrapolated = ", extrapolated" if share and name not in tried else ""
+            changes.append((name, f"{share:.3e}{extrapolated}", verdict))
+        lines = [size, _table(["parameter", "slope times a perturbation", "adjoint"], changes)]
         if not self.right:
             return "\n".join([*lines, f"The adjoint is WRONG: {consistency_words(self.consistency)}.", *self.beyond])
         ends = []
@@ -108,19 +101,16 @@ class Certificate:
             rows = [(one.estimator, f"{one.cosine:.3f}", f"{one.size:.3g}") for one in self.alignment.estimators]
             error = f"to the gradient of the smoothed loss, whose own error is {self.alignment.noise:.0%}"
             lines += [_table(["estimator", "cosine", "size"], rows), error]
+            if "(spread)" in self.estimator:
+                rounded = {name: float(f"{value:.3g}") for name, value in self.alignment.spread.items()}
+                spread = f" with spread = {rounded}"
         lines += [
             f"Up to step {self.horizon} of {self.steps}, {self.horizon * self.time_step:.4g} of "
             f"{self.steps * self.time_step:.4g} s, the exact gradient is useful. For {self.steps} steps use "
-            f"gradients.{self.estimator}{self._spread}.",
+            f"gradients.{self.estimator}{spread}.",
             *self.beyond,
         ]
         return "\n".join(lines)
-
-    def _changes(self) -> Iterator[tuple[str, str, str]]:
-        tried = {one.parameter for one in self.horizons if one.lasts}
-        for name, share in self.loss_changes.items():
-            verdict = "WRONG" if name in self.wrong else "right" if share else "no effect on this loss"
-            yield name, f"{share:.3e}" + (", extrapolated" if share and name not in tried else ""), verdict
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"
@@ -146,12 +136,6 @@ class Certificate:
             return "AdjointViscosity()"
         best = self.alignment.best
         return "RandomizedSmoothing()" if best is None else best.estimator
-
-    @property
-    def _spread(self) -> str:
-        if self.alignment is None or "(spread)" not in self.estimator:
-            return ""
-        return f" with spread = { {name: float(f'{value:.3g}') for name, value in self.alignment.spread.items()} }"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the certificate as a dict that can be written as JSON."""
@@ -199,7 +183,15 @@ def certify(
     require_whole("seed", seed, 0)
     if not 0.0 < as_one_number("perturbation", perturbation) < 1.0:
         raise InputError(f"perturbation is {shown(perturbation)}, but must be greater than 0 and less than 1.")
-    problem = _problem(problem, steps)
+    if not isinstance(problem, Problem):
+        if steps is None:
+            found = type(problem).__name__
+            raise InputError(f"steps is left out, but must be given to certify what is no Problem but a {found}.")
+        simulation = problem if isinstance(problem, Simulation) else Simulation(problem, precision="float64")
+        problem = Problem(simulation, steps, FinalPositions(simulation.positions))
+    elif steps is not None:
+        own = f"as the problem has {problem.steps} steps"
+        raise InputError(f"steps is {shown(steps)}, but must be left out, {own}.")
     if problem.simulation.batch is not None:
         raise InputError("problem is of a batch, but must be of one scene, as all scenes have the same derivatives.")
     problem.simulation.scene.solver.fixed_time_step("a certificate, whose differences would not hold chosen ones")
@@ -213,13 +205,12 @@ def certify(
         shorter = up_to(double, error.step - 1) if double is not problem else None
         if shorter is None:
             raise
-        found = _certified(shorter, first_rows(double, chosen, shorter.steps), perturbation, seed)
+        made = _certified(shorter, first_rows(double, chosen, shorter.steps), perturbation, seed)
         copied = f"in float64, in which gradients are certified, the run loses a particle in step {error.step}"
-        return replace(found, beyond=(f"Beyond step {shorter.steps} there is no answer: {copied}.", *found.beyond))
+        return replace(made, beyond=(f"Beyond step {shorter.steps} there is no answer: {copied}.", *made.beyond))
 
 
 def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
-    """Return the certificate of a float64 problem, or raise `DivergedError` if its run diverges."""
     random = np.random.default_rng(seed)
     history, values = LossHistory(problem), everything(problem, chosen)
     norms = AdjointNorms(problem.simulation.solver, problem.steps)
@@ -235,14 +226,22 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 
     sizes = scales(problem, chosen, perturbation)
     asked = {} if wrong else chosen
-    of_asked = {  # one over time may be given as one vector for all steps
-        name: exact.gradient[name] if exact.gradient[name].shape == value.shape else exact.gradient[name].sum(axis=0)
-        for name, value in asked.items()
-    }
+    of_asked = {name: exact.gradient[name] for name in asked}
+    for name, value in asked.items():  # one over time may be given as one vector for all steps
+        of_asked[name] = of_asked[name] if of_asked[name].shape == value.shape else of_asked[name].sum(axis=0)
     perturbations = coherent_directions(problem, chosen, sizes, random)
     known = {**problem.simulation.parameters(), **values}
     time = float(known["time_step"]) * max(problem.steps, 1)
     horizons = tuple(horizon(history, chosen, name, perturbations[name]) for name in asked)
+    for one in horizons:
+        moved = f"a run that the perturbation of {one.parameter} moves"
+        if one.reached == one.sample_steps[-1]:
+            continue
+        if one.reached == 0:
+            beyond.append(f"Of {one.parameter} there is no horizon: {moved} cannot begin, or loses a particle at once.")
+        else:
+            answer = f"there is no answer for {one.parameter}"
+            beyond.append(f"Beyond step {one.reached} {answer}: {moved} loses a particle.")
     return Certificate(
         particles=problem.simulation.particles,
         steps=problem.steps,
@@ -256,31 +255,15 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
         horizons=horizons,
         alignment=alignment(problem, asked, sizes, of_asked) if asked else None,
         beside=None if wrong else beside,
-        beyond=(*beyond, *filter(None, map(beyond_words, horizons))),
+        beyond=tuple(beyond),
     )
-
-
-def _problem(subject: Any, steps: int | None) -> Problem:
-    """Return a given problem, or make a problem from a scene or a simulation. The loss of a new problem is the mean
-    squared displacement of the particles."""
-    if isinstance(subject, Problem):
-        if steps is not None:
-            own = f"as the problem has {subject.steps} steps"
-            raise InputError(f"steps is {shown(steps)}, but must be left out, {own}.")
-        return subject
-    if steps is None:
-        found = type(subject).__name__
-        raise InputError(f"steps is left out, but must be given to certify what is no Problem but a {found}.")
-    simulation = subject if isinstance(subject, Simulation) else Simulation(subject, precision="float64")
-    return Problem(simulation, steps, FinalPositions(simulation.positions))
 
 
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """Check all parameters together. If this check fails, check each parameter separately. Return the check and the
-    names of the wrong parameters."""
-    together = check_consistency(history, values, gradient, balanced(gradient, along))
+    """Check all parameters together, or else each alone. Return the check and the names of the wrong parameters."""
+    together = check_consistency(history, values, gradient, along)
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
     alone = {name: check_consistency(history, values, gradient, {name: along[name]}) for name in along}
@@ -291,8 +274,7 @@ def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> 
     """Check the derivatives after small random changes of the initial positions and velocities. Return the check and
     its number of steps, or None and 0 if a particle is lost at once.
 
-    In fluid at rest the loss may have a corner, because it contains terms such as |v|. The adjoint is then a one-sided
-    derivative.
+    In fluid at rest the loss may have a corner, due to terms such as |v|. The adjoint is then a one-sided derivative.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
@@ -306,25 +288,14 @@ def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> 
             return None, 0
         moved, along = (first_rows(problem, one, shorter.steps) for one in (moved, along))
         problem, gradient = shorter, shorter.estimate(moved).gradient
-    return check_consistency(LossHistory(problem), moved, gradient, balanced(gradient, along)), problem.steps
+    return check_consistency(LossHistory(problem), moved, gradient, along), problem.steps
 
 
 WIDTH = 110
 
 
-def beyond_words(horizon: Horizon) -> str | None:
-    """Return a sentence on the steps without a result, or None if every step has a result."""
-    if horizon.reached == horizon.sample_steps[-1]:
-        return None
-    moved = f"a run that the perturbation of {horizon.parameter} moves"
-    if horizon.reached == 0:
-        return f"Of {horizon.parameter} there is no horizon: {moved} cannot begin, or loses a particle at once."
-    return f"Beyond step {horizon.reached} there is no answer for {horizon.parameter}: {moved} loses a particle."
-
-
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
-    """Describe how many digits of reverse mode, forward mode and central differences agree, and whether the loss has a
-    corner."""
+    """Describe how many digits of both modes and central differences agree, and whether the loss has a corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"

@@ -12,18 +12,8 @@ from cortado.calls import ShortRepr
 from cortado.device.precision import FLOAT64
 from cortado.errors import DivergedError
 from cortado.gradients.estimator import NO_RUN
-from cortado.losses import (
-    CentreOfMass,
-    CentreOfMassAlong,
-    FinalPositions,
-    Frames,
-    Image,
-    Loss,
-    SensorMatch,
-    Snapshot,
-    SnapshotAdjoint,
-)
-from cortado.losses.loss import Adjoint, by_field, slope
+from cortado.losses import CentreOfMass, CentreOfMassAlong, FinalPositions, Frames, Image, SensorMatch
+from cortado.losses.loss import Adjoint, Loss, Snapshot, SnapshotAdjoint, by_field, slope
 from cortado.losses.run_losses import as_loss
 from cortado.particles.state import State
 from cortado.problem import Problem
@@ -33,8 +23,7 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Return the problem of the first ``steps`` steps, or None if no step or frame remains. A `Frames` loss is cut to
-    the frames within these steps."""
+    """Return the problem of the first ``steps`` steps, with the frames within them, or None if nothing remains."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -58,18 +47,15 @@ def in_float64(problem: Problem) -> Problem:
     single = problem.simulation
     if single.precision == FLOAT64:
         return problem
-    loss = _loss_in_float64(problem.loss, single)
-    return Problem(single.in_precision("float64"), problem.steps, loss, 2 * problem.memory_budget)
 
+    def double(loss: Any) -> Any:
+        if isinstance(loss, Frames):
+            return Frames({step: double(one) for step, one in loss.losses.items()})
+        if type(loss) is Image and isinstance(loss.renderer, Renderer):
+            return Image(loss.renderer.in_precision(FLOAT64), loss.target, loss.distance)
+        return loss if type(loss) in ANY_PRECISION else Rounded(loss, single)
 
-def _loss_in_float64(loss: Any, single: Simulation) -> Any:
-    if isinstance(loss, Frames):
-        return Frames({step: _loss_in_float64(one, single) for step, one in loss.losses.items()})
-    if type(loss) in ANY_PRECISION:
-        return loss
-    if type(loss) is Image and isinstance(loss.renderer, Renderer):
-        return Image(loss.renderer.in_precision(FLOAT64), loss.target, loss.distance)
-    return Rounded(loss, single)
+    return Problem(single.in_precision("float64"), problem.steps, double(problem.loss), 2 * problem.memory_budget)
 
 
 class Rounded:
@@ -107,8 +93,7 @@ ABOVE_ROUND_OFF = 30.0
 
 
 class LossHistory:
-    """A problem with its loss after several numbers of steps, as if the run ended there. A `Frames` loss is evaluated
-    at the steps of its frames."""
+    """A problem with its loss after several numbers of steps, or after those of the frames of a `Frames` loss."""
 
     def __init__(self, problem: Problem):
         loss, steps = problem.loss, problem.steps
@@ -152,19 +137,15 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """Run with the parameters changed by ``-h`` and by ``h`` times the direction. Yield the loss and the two states
-        at each sample step, until a run diverges."""
-        behind, ahead = (
-            self._reached({**parameters, **{name: parameters[name] + step * d for name, d in along.items()}})
-            for step in (-h, h)
-        )
+        """Yield the losses, and the states of runs with ``-h`` and ``h`` times the direction, until a run diverges."""
+        moved = ({name: parameters[name] + step * d for name, d in along.items()} for step in (-h, h))
+        behind, ahead = (self._reached({**parameters, **one}) for one in moved)
         for step, loss in self._losses.items():
             if step in behind and step in ahead:
                 yield loss, behind[step], ahead[step]
 
     def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
-        """Return the states at the sample steps, up to the loss of a particle. The dict is empty if the run cannot
-        begin."""
+        """Return the states at the sample steps before the loss of a particle, none if the run cannot begin."""
         try:
             return self.problem.states(parameters, self._losses)
         except NO_RUN as error:
@@ -193,14 +174,15 @@ class LossHistory:
             wanted = [name for name in by_field(bar, dimension) if name not in dots[step]]
             more = self.problem.along(ends[step], wanted, dots[step], parameters, along)
             slopes.append(float(slope(bar, {**along, **dots[step], **more})))
-            strain.append(_strain(ends[step].positions, dots[step]["positions"]))
+            x, dot = ends[step].positions, dots[step]["positions"]
+            nearest = cKDTree(x).query(x, k=2)[1][:, 1] if len(x) > 1 else [0]
+            strain.append(float(np.sqrt(((dot - dot[nearest]) ** 2).sum(axis=1).mean())))
         losses = self._total([loss.value(ends[step]) for step, loss in self._losses.items()])
         return losses, self._total(slopes), np.array(strain)
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """Return the change of a loss between two states, from the mean of the adjoints at the two states. This
-    second-order formula avoids the round-off of the losses."""
+    """Return a loss's change between two states from the mean of both adjoints, without round-off, to second order."""
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
@@ -208,13 +190,6 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     beyond = {name for bar in bars for name in by_field(bar, before.dimension) if name not in distance}
     distance |= {name: after[name] - before[name] for name in beyond}
     return 0.5 * sum(float(slope(bar, distance)) for bar in bars)
-
-
-def _strain(positions: np.ndarray, dot: np.ndarray) -> float:
-    if len(positions) < 2:
-        return 0.0
-    nearest = cKDTree(positions).query(positions, k=2)[1][:, 1]
-    return float(np.sqrt(((dot - dot[nearest]) ** 2).sum(axis=1).mean()))
 
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
@@ -226,8 +201,7 @@ PLATEAU = 1e-3
 CORNER = 1e-4
 """Least relative difference between the two one-sided slopes at a corner of the loss."""
 SLACK = 10.0
-"""Greatest accepted distance of forward mode from a central difference, relative to the distance between two successive
-central differences."""
+"""Greatest accepted distance of forward mode from a difference, relative to that of two successive differences."""
 RESOLUTION = 1e-6
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 FAINT = 1e-4
@@ -253,8 +227,7 @@ class Consistency(ShortRepr):
     tangents: np.ndarray
     """Directional derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps), for each step size. Empty if reverse and forward mode already
-    differ."""
+    """Central differences (tried, sample_steps) by step size. Empty if reverse and forward mode already differ."""
     sides: np.ndarray
     """Distances (tried, sample_steps) between the two one-sided differences, for each step size."""
     steps: np.ndarray
@@ -277,20 +250,17 @@ class Consistency(ShortRepr):
 
     @property
     def misses(self) -> np.ndarray:
-        """Relative distances (tried, sample_steps) of the central differences from forward mode. Each value is the
-        maximum over the sample steps so far."""
+        """Relative distances (tried, sample_steps) of differences from forward mode, at most so far."""
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
     def corner(self) -> np.ndarray:
-        """Relative distances (sample_steps,) between the two one-sided differences, as the minimum over the step sizes.
-        The distance is about 0 unless the loss has a corner."""
+        """Least relative distances (sample_steps,) of both one-sided differences, 0 without a corner."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
     def is_on_a_corner(self) -> bool:
-        """True if the loss has a corner: reverse and forward mode agree, but the one-sided differences have different
-        limits."""
+        """True if the loss has a corner: both modes agree, but the one-sided differences have different limits."""
         slopes = self.corner[self.converged]
         return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
@@ -306,8 +276,7 @@ class Consistency(ShortRepr):
 
     @property
     def miss(self) -> float | None:
-        """Least relative distance of forward mode from a central difference at the last converged sample step,
-        or None."""
+        """Least relative distance of forward mode from a difference at the last converged sample step, or None."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
@@ -339,18 +308,17 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
     changes = {name: abs(float((gradient[name] * along).sum())) for name, along in directions.items()}
     finite = [change for change in changes.values() if np.isfinite(change)]
     strongest = max(finite, default=0.0)
-    felt = [change for change in finite if change > FAINT * strongest]
+    least = min((change for change in finite if change > FAINT * strongest), default=0.0)
+    found = dict(directions)
+    for k, (name, change) in enumerate(changes.items()):
+        if change > FAINT * strongest:
+            found[name] = (1.0 + k * GOLDEN % 1.0) * least / change * directions[name]
+    return found
 
-    def scale(k: int, name: str) -> float:
-        wanted = (1.0 + k * GOLDEN % 1.0) * min(felt, default=0.0)
-        return wanted / changes[name] if changes[name] > FAINT * strongest else 1.0
 
-    return {name: scale(k, name) * along for k, (name, along) in enumerate(directions.items())}
-
-
-def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays) -> Consistency:
-    """Compare the directional derivatives by reverse mode, forward mode and central differences. ``gradient`` is the
-    result of reverse mode."""
+def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, directions: Arrays) -> Consistency:
+    """Compare derivatives along `balanced` directions; ``gradient`` has those of reverse mode."""
+    along = balanced(gradient, directions)
     losses, tangents, _ = history.tangent(values, along)
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])
     found: list[tuple[np.ndarray, np.ndarray]] = []

@@ -17,18 +17,15 @@ from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Parameter, Range, Role
 
 PERTURBATION = 0.05
-"""Size of a meaningful perturbation, relative to the parameter's value. Positions and velocities are perturbed relative
-to the spacing and to the speed of a fall."""
+"""Size of a meaningful perturbation, relative to a parameter, the spacing, or the speed of a fall."""
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     """Return the values of parameters, given as a table of values or as names."""
     simulation = problem.simulation
     if problem.state is not None:
-        raise InputError(
-            "problem begins at a state, but must begin as its scene does, as certificates vary first positions and "
-            "velocities, too."
-        )
+        said = "problem begins at a state, but must begin as its scene does"
+        raise InputError(f"{said}, as certificates vary first positions and velocities, too.")
     values = ParameterSpace(simulation, problem.steps).defaults()
     for view, other in simulation.known.views.items():
         parameter = simulation.known[view]
@@ -60,13 +57,11 @@ def everything(problem: Problem, chosen: Arrays) -> Arrays:
     for name, value in values.items():
         parameter = problem.simulation.known[name]
         over_time = parameter.axis is Axis.STEP
-        idle = over_time and problem.steps == 0
-        idle = idle or any(view in chosen and name == other for view, other in problem.simulation.known.views.items())
-        idle = idle or not _moves_both_ways(parameter, value)
-        if idle or not parameter.acts(problem.simulation, values):
-            continue
-        row = value.shape[value.ndim - parameter.rank :]
-        found[name] = np.broadcast_to(value, (problem.steps, *row)).copy() if over_time else value
+        replaced = any(view in chosen and name == other for view, other in problem.simulation.known.views.items())
+        idle = replaced or (over_time and problem.steps == 0) or not _moves_both_ways(parameter, value)
+        if not idle and parameter.acts(problem.simulation, values):
+            row = value.shape[value.ndim - parameter.rank :]
+            found[name] = np.broadcast_to(value, (problem.steps, *row)).copy() if over_time else value
     return found
 
 
@@ -78,24 +73,18 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
     """Return the size of a meaningful perturbation of each parameter, in the parameter's shape and unit. The size is a
     fraction of the parameter's value, of the spacing, or of the speed of a fall."""
     known = problem.simulation.known
-    return {
-        name: np.broadcast_to(perturbation * known[name].change(problem.simulation, value), value.shape)
-        for name, value in values.items()
-    }
+    sizes = {name: perturbation * known[name].change(problem.simulation, value) for name, value in values.items()}
+    return {name: np.broadcast_to(size, values[name].shape) for name, size in sizes.items()}
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return a random direction of the given size for each parameter. The direction of a scalar parameter is
-    positive."""
-    return {
-        name: sizes[name] * (random.standard_normal(value.shape) if value.ndim else 1.0)
-        for name, value in values.items()
-    }
+    """Return a random direction of the given size for each parameter, which is positive for scalars."""
+    drawn = {name: random.standard_normal(value.shape) if value.ndim else 1.0 for name, value in values.items()}
+    return {name: sizes[name] * part for name, part in drawn.items()}
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions that are smooth in space and constant in time. If the first position of a path is fixed,
-    the direction grows from 0."""
+    """Return random directions that are smooth in space and constant in time. Directions of fixed paths grow from 0."""
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
@@ -114,8 +103,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Return the growth of an adjoint from the last state to the first [e-folds], from a line fitted to the logarithm
-    of ``norms``."""
+    """Return the growth of an adjoint from the last state to the first [e-folds], by a line through log ``norms``."""
     steps = len(norms) - 1
     total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
     there = np.flatnonzero(total > 0.0)
@@ -134,8 +122,7 @@ LINEAR = 0.3
 
 @dataclass(frozen=True, repr=False)
 class Horizon(ShortRepr):
-    """The directional derivatives of the loss for a meaningful perturbation of one parameter: exact and by a finite
-    difference."""
+    """The derivatives of the loss for a meaningful perturbation of one parameter: exact and by a difference."""
 
     parameter: str
     sample_steps: np.ndarray
@@ -154,8 +141,7 @@ class Horizon(ShortRepr):
 
     @property
     def measured(self) -> int:
-        """Last sample step at which the exact derivative is useful, and was useful at the previous sample step. 0
-        without any."""
+        """Last sample step at which the exact derivative is useful, as at the previous sample step, or 0."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0

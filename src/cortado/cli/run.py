@@ -90,7 +90,7 @@ class RunRecording:
             return 0
         found, begun = Trajectory.load(self.folder.trajectory), self.rollout.clocks[0].steps
         readings = self.folder.read_sensors()
-        known = min(len(found.converged), self.watch.known(readings))
+        known = min(len(found.converged), self.watch.logs[0].known(readings))
         frames = found[: int(np.count_nonzero(found.steps - begun <= known))]
         if len(frames) < 2:  # the first one alone is what a new run begins with
             return 0
@@ -98,7 +98,7 @@ class RunRecording:
         state.set({name: frames.last_state[name] for name in self.simulation.frame(state)})
         noted = {name: column[:step] for name, column in frames.diagnostics.items()}
         self.rollout.progress, self.kept = Progress(step, state, noted), frames
-        self.watch.go_on(step, readings)
+        self.watch.logs[0].go_on(step, readings)
         return step
 
     def run(self) -> State:
@@ -116,7 +116,7 @@ class RunRecording:
             notes, done = Notes(self, writer), 0
             if self.kept is None:
                 append_frame(writer, first, rollout.clocks[0].steps, self.watch.frame(0, rollout.initial))
-                self.watch.first()
+                self.watch.read(0, rollout.initial)
             else:
                 self.kept.write_frames(writer)
                 done = done_of(rollout, rollout.progress.step, float(self.kept.times[-1]))

@@ -16,8 +16,7 @@ __all__ = ["EnvState", "FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 
 
 def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
-    """Make ``num_envs`` environments of a task, such as "Carry". All environments are simulated together. ``settings``
-    are arguments of `FluidVectorEnv`."""
+    """Make ``num_envs`` environments of a task, such as "Carry", together, with ``settings`` of `FluidVectorEnv`."""
     return FluidVectorEnv(task, num_envs, **settings)
 
 

@@ -25,19 +25,15 @@ def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[s
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return the actuators of a solid that moves along x and turns about z. The greatest velocities are ``fastest``
-    [m/s] and ``turning`` [rad/s]."""
+    """Return the actuators of a solid that moves along x, at most ``fastest`` [m/s], and turns about z [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
-    return (
-        Velocity(f"{solid}.displacement", still, (0,), (fastest,)),
-        Velocity(f"{solid}.turn", greatest=(turning,), is_number=plane, **turn),
-    )
+    moved = Velocity(f"{solid}.displacement", still, (0,), (fastest,))
+    return moved, Velocity(f"{solid}.turn", greatest=(turning,), is_number=plane, **turn)
 
 
 class Vessels(Task):
-    """A base class of tasks with cups and jugs. In 2-D the vessels are cross-sections. In 3-D they are round, with axes
-    in the plane z = 0."""
+    """A base class of tasks with cups and jugs, which are cross-sections in 2-D, and round about z = 0 in 3-D."""
 
     view: ClassVar[dict[str, Any]] = {}
 
@@ -45,22 +41,19 @@ class Vessels(Task):
         return [x, y, 0.0][: self.dimension]
 
     def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Return the corners of a box [m], given its cross-section. In 3-D the box has a square base centred
-        at z = 0."""
+        """Return the corners of a box with a cross-section [m]. In 3-D the box has a square base about z = 0."""
         half = 0.5 * (upper[0] - lower[0])
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the scene table of a fluid with the given cross-section [m]. The fluid is a box in 2-D and a cylinder
-        in 3-D."""
+        """Return the table of a fluid with a cross-section [m]: a box in 2-D, and a cylinder in 3-D."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
         return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
 
     def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
-        """Return the scene table of a container in 2-D. In 3-D the table is empty, and spilt fluid falls
-        without end."""
+        """Return the scene table of a container in 2-D. In 3-D there is none, and spilt fluid falls without end."""
         return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
 
 
@@ -68,17 +61,15 @@ class Carry(Vessels):
     """The task of carrying a cup of water to a place without spilling.
 
     The actions are the cup's velocity along x and its angular velocity. The goal is the target position of the cup's
-    centre. The reward is minus the cup's distance from the goal [m], minus 10 times the fraction of water outside the
-    cup.
+    centre. The reward is minus the cup's distance from the goal [m], minus 10 times the fraction of water outside.
 
     Task and reward follow TransportWater of SoftGym (Lin et al. 2020). In contrast to SoftGym, the fraction is a smooth
     function of particle positions (`cortado.environments.terms.Share`), and the cup can lean.
     """
 
     name = "Carry"
-    horizon, repeats = 75, 6
+    horizon, repeats, lowest = 75, 6, -12.0
     coarse_spacing, coarse_step = 0.0125, 0.0025
-    lowest = -12.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the cup [m]",)
     width, depth, height, wall = 0.15, 0.1, 0.175, 0.05
     """Inner width of the cup, depth of the water, inner height of the cup, and thickness of the walls [m]."""
@@ -112,8 +103,7 @@ class Carry(Vessels):
 class CarryInSpace(Carry):
     """The task of carrying a round cup of water along a line to a place without spilling.
 
-    Actions, goal and reward are the same as for `Carry`. The cup is lower, and leans about a horizontal axis
-    perpendicular to its path.
+    Actions, goal and reward are the same as for `Carry`. The cup is lower, and leans about an axis across its path.
     """
 
     name = "CarryInSpace"
@@ -124,8 +114,7 @@ class CarryInSpace(Carry):
 
 
 class Latte(Task):
-    """The task of pouring milk from a moving nozzle into coffee. The milk should land as if the nozzle followed a
-    hidden path.
+    """The task of pouring milk from a moving nozzle into coffee. The milk should land as from a hidden path.
 
     The actions are target positions of the nozzle along x. The reward is minus the mean squared distance of the poured
     milk from its positions in a run with the hidden path, divided by the squared radius of the cup.
@@ -134,9 +123,8 @@ class Latte(Task):
     """
 
     name = "Latte"
-    horizon, repeats = 32, 6
+    horizon, repeats, lowest = 32, 6, -4.0
     coarse_spacing, coarse_step = 0.0025, 0.0014
-    lowest = -4.0
     radius, depth, opening, column = 0.03, 0.015, 0.0025, 0.0625
     """Radius of the cup, depth of the coffee, half-width of the nozzle, and height of the milk in the nozzle [m]."""
     height = depth + 0.005
@@ -172,8 +160,7 @@ def hidden_actions(task: Latte) -> NDArray:
 
 @cache
 def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
-    """Return the particle positions after each step of the hidden path (horizon, n, d) [m], and the weights of the
-    poured milk (horizon, n) [1/m2]."""
+    """Return the positions on the hidden path (horizon, n, d) [m], and the weights of the milk (horizon, n) [1/m2]."""
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
@@ -198,9 +185,8 @@ class Pour(Vessels):
     """
 
     name = "Pour"
-    horizon, repeats = 75, 10
+    horizon, repeats, lowest = 75, 10, 0.0
     coarse_spacing, coarse_step = 0.0125, 0.00154
-    lowest = 0.0
     lower, upper, wall = (0.25, -0.28), (0.45, -0.12), 0.05
     """Lower and upper corner of the inside of the glass, and thickness of the walls [m]."""
     fastest, turning = 0.1, 4.0
@@ -259,9 +245,8 @@ class Raft(Task):
     """
 
     name = "Raft"
-    horizon, repeats = 40, 8
+    horizon, repeats, lowest = 40, 8, -15.0
     coarse_spacing, coarse_step = 0.025, 0.003
-    lowest = -15.0
     free_solids: ClassVar[tuple[str, ...]] = ("raft",)
     goal_names: ClassVar[tuple[str, ...]] = ("x of the raft [m]",)
     length = 0.25
@@ -297,9 +282,8 @@ class Splash(Task):
 
     half = 0.3
     name = "Splash"
-    horizon, repeats = 40, 5
+    horizon, repeats, lowest = 40, 5, 0.0
     coarse_spacing, coarse_step = half / 12, 0.003
-    lowest = 0.0
     goal_names: ClassVar[tuple[str, ...]] = ("x of the stem [m]",)
     gravity, strength, lag = 9.81, 12.0, 0.05
     """Gravity and greatest acceleration of the box [m/s2], and time constant of the acceleration [s]."""
@@ -345,9 +329,8 @@ class Stir(Task):
     """
 
     name = "Stir"
-    horizon, repeats = 50, 16
+    horizon, repeats, lowest = 50, 16, -1.0
     coarse_spacing, coarse_step = 0.005, 0.001
-    lowest = -1.0
     width, depth, milky = 0.08, 0.045, 0.02
     """Width of the cup, depth of the fluid, and size of the region with milk in its left half [m]."""
     spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
@@ -376,9 +359,8 @@ class Stir(Task):
         return Reward(((1.0, Spread(milk, spread)),), constant=-1.0)
 
 
-TASKS: dict[str, type[Task]] = {
-    one.name: one for one in (Carry, CarryInSpace, Latte, Pour, PourInSpace, Raft, Splash, Stir)
-}
+_TASKS: tuple[type[Task], ...] = Carry, CarryInSpace, Latte, Pour, PourInSpace, Raft, Splash, Stir
+TASKS = {one.name: one for one in _TASKS}
 
 
 def task_of(task: str | Task, size: str | None) -> Task:

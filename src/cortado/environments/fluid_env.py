@@ -42,10 +42,8 @@ class Twin:
         start = (scenes if state is None else state).starts[number]
         self._actuators = task.actuators
         self._start = {"initial_positions": start.positions} if state is None else {}
-        self.coordinates = {
-            one.parameter: one.over(count, m, task.time_step, now)
-            for one, now in zip(task.actuators, begun, strict=True)
-        }
+        each = zip(task.actuators, begun, strict=True)
+        self.coordinates = {one.parameter: one.over(count, m, task.time_step, now) for one, now in each}
         """Maps from each actuator's actions to its parameter."""
         goal = start.goal[None]
         loss = Frames({k * m: MinusReward(scenes.reward, goal, done + k) for k in range(1, count + 1)})
@@ -79,34 +77,36 @@ class Twin:
         from cortado.jax import value
         from cortado.optimisation.layers.with_jax import jnp
 
-        loss = self._of_actions(value(self.problem, gradient), lambda a, u: jnp.asarray(a, u.dtype), jnp.tensordot)
-        return lambda actions: loss(jnp.asarray(actions))
+        def like(numbers: NDArray, u: Any) -> Any:
+            return jnp.asarray(numbers, u.dtype)
+
+        loss = value(self.problem, gradient)
+        return lambda actions: self._loss(loss, jnp.asarray(actions), like, jnp.tensordot)
 
     def in_torch(self, gradient: GradientEstimator | None = None) -> Any:
         """Return the loss as a differentiable function of a PyTorch tensor (actions, a). See `cortado.torch.value`."""
         from cortado.optimisation.layers.with_torch import torch
         from cortado.torch import value
 
-        return self._of_actions(value(self.problem, gradient), lambda a, u: u.new_tensor(a), torch.tensordot)
+        loss = value(self.problem, gradient)
+        return lambda actions: self._loss(loss, actions, lambda numbers, u: u.new_tensor(numbers), torch.tensordot)
 
-    def _of_actions(self, loss: Any, like: Any, tensordot: Any) -> Any:
-        def of_actions(actions: Any) -> Any:
-            shape = getattr(actions, "shape", None)
-            if shape is None or tuple(shape) != self.shape:
-                found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
-                raise InputError(f"actions {found}, but must be an array {self.shape}.")
-            u, parameters, first = actions.clip(-1.0, 1.0), dict[str, Any](self._start), 0
-            for one in self._actuators:
-                last, affine = first + len(one.axes), self.coordinates[one.parameter]
-                own = tensordot(like(affine.matrix, u), u[:, first:last], 2)
-                parameters[one.parameter], first = like(affine.base, u) + own, last
-            return loss(parameters)
-
-        return of_actions
+    def _loss(self, loss: Any, actions: Any, like: Any, tensordot: Any) -> Any:
+        shape = getattr(actions, "shape", None)
+        if shape is None or tuple(shape) != self.shape:
+            found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
+            raise InputError(f"actions {found}, but must be an array {self.shape}.")
+        u, parameters, first = actions.clip(-1.0, 1.0), dict[str, Any](self._start), 0
+        for one in self._actuators:
+            last, affine = first + len(one.axes), self.coordinates[one.parameter]
+            own = tensordot(like(affine.matrix, u), u[:, first:last], 2)
+            parameters[one.parameter], first = like(affine.base, u) + own, last
+        return loss(parameters)
 
 
 try:
     import gymnasium
+    from gymnasium.spaces import Box
     from gymnasium.utils.seeding import np_random
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
@@ -120,8 +120,7 @@ Info = dict[str, Any]
 
 
 class FluidEnv(gymnasium.Env[Observation, NDArray]):
-    """A Gymnasium environment of one scene, made by ``gymnasium.make("cortado/Carry-v0")``. `docs/environments.md`
-    describes it."""
+    """A Gymnasium environment of one scene: ``gymnasium.make("cortado/Carry-v0")``. See `docs/environments.md`."""
 
     metadata = METADATA
 
@@ -148,9 +147,9 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         """
         settings = size, device, precision, particles, sensors, render_mode
         self._envs = FluidVectorEnv(task, 1, *settings, AutoresetMode.DISABLED)
-        self.scenes, self.render_mode = self._envs.scenes, self._envs.render_mode
-        self.observation_space, actions = spaces(self.scenes)
-        self.action_space, self._shape, self._begun = actions, actions.shape, False
+        self.scenes, self.render_mode, self._begun = self._envs.scenes, self._envs.render_mode, False
+        self.observation_space, self._shape = self._envs.single_observation_space, self._envs._shape[1:]
+        self.action_space = self._envs.single_action_space
 
     @property
     def layout(self) -> dict[str, slice]:
@@ -204,8 +203,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return self._envs.save()
 
     def restore(self, state: EnvState) -> Observation:
-        """Return to a saved state, and return its observation. Raises `InputError` for a state of a different task,
-        batch or scene."""
+        """Return to a saved state and return its observation. Raises `InputError` for another task, batch or scene."""
         self._envs._generators = [self.np_random]
         seen: Observation = self._envs.restore(state)[0]
         self._begun, self._envs._horizon = True, self.scenes.task.horizon  # a wrapper does not know its step number
@@ -218,8 +216,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
 
 class FluidVectorEnv(VectorEnv):
-    """A Gymnasium vector environment, which simulates a batch of scenes. The results of each scene are bitwise equal to
-    the results of a single environment with the same seed."""
+    """A Gymnasium vector environment of a batch of scenes, with the bits of single ones with the same seeds."""
 
     def __init__(
         self,
@@ -237,18 +234,21 @@ class FluidVectorEnv(VectorEnv):
         """Make a batch of ``num_envs`` scenes.
 
         ``autoreset_mode`` is the same as in `gymnasium.vector.SyncVectorEnv`. ``max_episode_steps`` is the number of
-        steps of an episode before it is truncated, by default the task's horizon. `FluidEnv` describes the remaining
-        arguments.
+        steps of an episode before it is truncated, by default the task's horizon. See `FluidEnv` for other arguments.
         """
-        self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), checked_render_mode(render_mode)
+        self.num_envs, self.render_mode = whole_number("num_envs", num_envs, 1), render_mode
+        if render_mode not in (None, *METADATA["render_modes"]):
+            raise InputError(f'render_mode is {shown(render_mode)}, but must be None or "rgb_array".')
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
             wanted = ", ".join(f'"{mode.value}"' for mode in AutoresetMode)
             raise InputError(f"autoreset_mode is {shown(autoreset_mode)}, but must be one of {wanted}.") from None
         self.scenes = Scenes(task_of(task, size), self.num_envs, device, precision, particles, sensors)
-        self.single_observation_space, actions = spaces(self.scenes)
-        self.single_action_space, self._shape = actions, (num_envs, *actions.shape)
+        self._observations = self.scenes.observed()
+        actions = sum(len(one.axes) for one in self.scenes.task.actuators)
+        self.single_observation_space = Box(-np.inf, np.inf, self._observations.shape[1:], np.float32)
+        self.single_action_space, self._shape = Box(-1.0, 1.0, (actions,), np.float32), (num_envs, actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.metadata = {**METADATA, "autoreset_mode": self._mode}
@@ -257,7 +257,6 @@ class FluidVectorEnv(VectorEnv):
         self._generators: list[np.random.Generator] = [np_random()[0] for _ in range(num_envs)]
         self._over = np.ones(num_envs, dtype=bool)
         """Mask (num_envs,) of ended episodes."""
-        self._observations = self.scenes.observed()
 
     @property
     def layout(self) -> dict[str, slice]:
@@ -289,7 +288,7 @@ class FluidVectorEnv(VectorEnv):
             if mask[b] and own is not None:
                 self._generators[b] = np_random(own)[0]
         self._begin(mask)
-        self._observe(mask)
+        self._observations = np.where(mask[:, None], self.scenes.observed(), self._observations)
         return self._observations.copy(), {}
 
     def step(self, actions: NDArray) -> tuple[Observation, NDArray, NDArray, NDArray, Info]:
@@ -312,7 +311,7 @@ class FluidVectorEnv(VectorEnv):
             rewards[anew] = 0.0
             self.scenes.begin(begun)  # these do not take this step
         terminated = np.isin(np.arange(self.num_envs), list(lost))
-        self._observe(~terminated)
+        self._observations = np.where(terminated[:, None], self._observations, self.scenes.observed())
         truncated = ~terminated & (self.scenes.step_number >= self._horizon)
         self._over, infos = terminated | truncated, Info()
         for b, sentence in lost.items():
@@ -323,7 +322,7 @@ class FluidVectorEnv(VectorEnv):
                 final = {"diverged": lost[b]} if b in lost else {}
                 infos = self._add_info(infos, {"final_obs": self._observations[b], "final_info": final}, b)
             self._begin(over)
-            self._observe(over)
+            self._observations = np.where(over[:, None], self.scenes.observed(), self._observations)
         return self._observations.copy(), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -331,15 +330,13 @@ class FluidVectorEnv(VectorEnv):
         return tuple(pictures(self.scenes)) if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return the state of all episodes and random generators; see `FluidEnv.save`. Index the result to select and
-        reorder episodes, such as ``state[[0, 0, 2]]``."""
+        """Return the state of all episodes and random generators. Its index selects episodes: ``state[[0, 0, 2]]``."""
         self._require_open("save")
         random = [one.bit_generator.state for one in self._generators]
         return self.scenes.save(self._over, self._observations, random)
 
     def restore(self, state: EnvState) -> Observation:
-        """Return to a saved state with the same number of environments, and return its observations. See
-        `FluidEnv.restore`."""
+        """Return to a saved state with as many environments, and return its observations. See `FluidEnv.restore`."""
         self._require_open("restore")
         self.scenes.restore(state)
         for generator, own in zip(self._generators, state.generators, strict=True):
@@ -362,22 +359,6 @@ class FluidVectorEnv(VectorEnv):
         self._over = self._over & ~which
         return starts
 
-    def _observe(self, which: NDArray) -> None:
-        self._observations = np.where(which[:, None], self.scenes.observed(), self._observations)
-
-
-def spaces(scenes: Scenes) -> tuple[Any, Any]:
-    seen = scenes.observed().shape[1]
-    actions = sum(len(one.axes) for one in scenes.task.actuators)
-    everything = gymnasium.spaces.Box(-np.inf, np.inf, (seen,), np.float32)
-    return everything, gymnasium.spaces.Box(-1.0, 1.0, (actions,), np.float32)
-
-
-def checked_render_mode(mode: str | None) -> str | None:
-    if mode not in (None, *METADATA["render_modes"]):
-        raise InputError(f'render_mode is {shown(mode)}, but must be None or "rgb_array".')
-    return mode
-
 
 def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
     """Return the saved state in the options of a reset, or None. Raises `InputError` for unsuitable options."""
@@ -395,10 +376,9 @@ def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
 def pictures(scenes: Scenes) -> list[NDArray[np.uint8]]:
     simulation, found = scenes.simulation, []
     fields = scenes.state.arrays.numpy(simulation.dimension)
-    own = ("positions", "velocities", "mass_fractions")
     for b in range(len(scenes)):
-        others = {name: array[b] for name, array in fields.items() if name not in own}
-        fractions = fields["mass_fractions"][b] if len(simulation.scene.phase) > 1 else None
-        frame = Frame(fields["positions"][b], fields["velocities"][b], fractions, 0.0, others=others)
+        others = {name: array[b] for name, array in fields.items()}
+        x, v, fractions = (others.pop(name) for name in ("positions", "velocities", "mass_fractions"))
+        frame = Frame(x, v, fractions if len(simulation.scene.phase) > 1 else None, 0.0, others=others)
         found.append(to_srgb(simulation.picture(frame, width=WIDTH, height=HEIGHT)))
     return found

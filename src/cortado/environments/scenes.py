@@ -1,7 +1,6 @@
 """Step many scenes of one task together, and save and restore their states.
 
-On a CPU, only launches with few particles are captured as graphs. A batch of medium size is therefore split into
-several launches.
+On a CPU, only launches with few particles are captured as graphs. A batch of medium size is therefore split.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -19,6 +18,7 @@ from cortado.device.launching import LEAST_PART, launch
 from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 from cortado.environments.kernels import environment_kernels
 from cortado.environments.task import Task, checked_scene, split
+from cortado.environments.terms import StepEnd
 from cortado.errors import DivergedError, InputError, MassWarning, shown, unwarned
 from cortado.losses.loss import SnapshotBatch
 from cortado.particles.state import State
@@ -52,13 +52,11 @@ class Start:
 class EnvState:
     """The saved state of an environment or a batch, returned by `save` and accepted by `restore`.
 
-    The state shares device arrays with the environment, which no step overwrites. After pickling or copying, it has
-    NumPy arrays.
+    The state shares device arrays with the environment, which no step overwrites. Pickles have NumPy arrays.
     """
 
     kind: str
-    """Text with the number of scenes, task, size, precision and observation. A state can only be restored in
-    environments with the same text."""
+    """Text with the number of scenes, task, size, precision and observation. `restore` needs the same text."""
     scene: Scene
     fields: Mapping[str, Any]
     """Fields of the fluid by name (scenes * n,), as Warp or NumPy arrays."""
@@ -79,6 +77,7 @@ class EnvState:
     def __len__(self) -> int:
         return len(self.step_number)
 
+    @WARP
     def __getitem__(self, numbers: int | Iterable[int]) -> "EnvState":
         """Return the state of a batch that consists of the chosen scenes. Numbers may repeat: ``state[[0] * 8]`` is a
         batch of eight scenes in the state of scene 0, with equal random generators."""
@@ -88,10 +87,14 @@ class EnvState:
         arrays: Any = {name: getattr(self, name)[chosen] for name in ("step_number", "over", "observations")}
         for name in ("clocks", "starts", "generators"):
             arrays[name] = tuple(getattr(self, name)[b] for b in chosen)
+        fields = {}
+        for name, array in self.fields.items():
+            n = len(array) // len(self)
+            fields[name] = _joined([array[b * n : (b + 1) * n] for b in chosen])
         return replace(
             self,
             kind=self.kind.replace(counted(len(self), "scene"), counted(len(chosen), "scene"), 1),
-            fields={name: _picked(array, chosen, len(self)) for name, array in self.fields.items()},
+            fields=fields,
             driven=tuple(one[chosen] for one in self.driven),
             lost=frozenset(k for k, b in enumerate(chosen) if b in self.lost),
             **arrays,
@@ -107,15 +110,14 @@ class EnvState:
 
 
 @WARP
-def _picked(array: Any, chosen: list[int], scenes: int) -> Any:
-    n = len(array) // scenes
-    parts = [array[b * n : (b + 1) * n] for b in chosen]
-    if isinstance(array, np.ndarray):
+def _joined(parts: list[Any]) -> Any:
+    if isinstance(parts[0], np.ndarray):
         return np.concatenate(parts)
-    found = wp.empty(len(chosen) * n, dtype=array.dtype, device=array.device)
-    for k, part in enumerate(parts):
-        wp.copy(found, part, dest_offset=k * n)
-    return found
+    whole, begin = wp.empty(sum(map(len, parts)), dtype=parts[0].dtype, device=parts[0].device), 0
+    for part in parts:
+        wp.copy(whole, part, dest_offset=begin)
+        begin += len(part)
+    return whole
 
 
 def parts_of(simulation: Simulation) -> int:
@@ -130,8 +132,7 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """A stepper that splits a batch into parts and advances each part by ``steps`` steps. The split does not change the
-    bits of the result."""
+    """A stepper that advances parts of a batch by ``steps`` steps each. The split does not change any bits."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
         scenes = simulation.batch or 1
@@ -167,31 +168,16 @@ class SideBySide:
             found[k] = self.steppers[k].follow(DeviceState(part, scenes), own)
 
         in_parallel(take, range(len(self.steppers)), min(usable_cores(), MOST_CORES, len(self.steppers)))
-        return _together(state.arrays, [found[k] for k in range(len(self.steppers))])
-
-
-@WARP
-def _together(like: State, parts: list[DeviceState]) -> DeviceState:
-    whole = {name: wp.empty_like(like[name]) for name in like.names}
-    for name, array in whole.items():
-        begin = 0
-        for part in parts:
-            wp.copy(array, part.arrays[name], dest_offset=begin)
-            begin += len(part.arrays[name])
-    return DeviceState(State(like.fields, whole, like.batch), tuple(one for part in parts for one in part.scenes))
+        parts, like = [found[k] for k in range(len(self.steppers))], state.arrays
+        joined = {name: _joined([one.arrays[name] for one in parts]) for name in like.names}
+        return DeviceState(State(like.fields, joined, like.batch), tuple(one for part in parts for one in part.scenes))
 
 
 class Scenes:
     """A batch of scenes of one task, which are stepped together. Each scene has its own episode."""
 
     def __init__(
-        self,
-        task: Task,
-        scenes: int,
-        device: str,
-        precision: str,
-        seen: int,
-        sensors: Mapping[str, Sensor] | None = None,
+        self, task: Task, scenes: int, device: str, precision: str, seen: int, sensors: Mapping[str, Sensor] | None
     ):
         self._sensors = checked_sensors(sensors, {"particles", "goal", "progress", *task.free_solids, *task.driven})
         self.task = task
@@ -303,7 +289,7 @@ class Scenes:
         """Step all scenes with actions (scenes, a) from -1 to 1. Return the rewards (scenes,), and the error messages
         of diverged scenes by scene number. Diverged scenes must be reset."""
         self.advance(actions)
-        rewards = self.reward.values(self.reward.at(self.state.arrays, self.goal, self.step_number))
+        rewards = self.reward.values(StepEnd(self.state.arrays, self.goal, self.step_number, self._domain))
         lost = {}
         for b, error in self._steps.lost.items():
             lost[b] = f"The episode ended in its step {self.step_number[b]}: {error}"
@@ -323,12 +309,16 @@ class Scenes:
     @property
     def parts(self) -> dict[str, NDArray]:
         """Return the observed arrays by name, with a first axis for the scenes. See `docs/environments.md`."""
-        arrays, task = self.state.arrays, self.task
-        now = {one.parameter: own for one, own in zip(task.actuators, self._now, strict=True)}
-        free = {name: self._free(arrays, name) for name in task.free_solids}
-        share = self.step_number[:, None] / task.horizon
-        found = {"particles": self._particles(arrays), **now, **free, "goal": self.goal, "progress": share}
-        return {**found, **self._read(arrays)}
+        state, task = self.state.arrays, self.task
+        found: dict[str, NDArray] = {"particles": self._particles(state)}
+        found |= {one.parameter: own for one, own in zip(task.actuators, self._now, strict=True)}
+        for name in task.free_solids:  # position, cosine and sine of the angle, velocity and angular velocity
+            fields = position_name(name), f"{name}.{AXES[0]}", velocity_name(name)
+            place, axis, velocity = (state[field].numpy()[:, :2] for field in fields)
+            rate = state[angular_velocity_name(name)].numpy()[:, None]
+            found[name] = np.concatenate([self._domain.wrapped(place), axis + [1.0, 0.0], velocity, rate], axis=1)
+        found |= {"goal": self.goal, "progress": self.step_number[:, None] / task.horizon}
+        return found | self._read(state) if self._sensors else found
 
     @property
     def _driven(self) -> dict[str, NDArray]:
@@ -361,8 +351,6 @@ class Scenes:
         return seen.numpy()
 
     def _read(self, state: State) -> dict[str, NDArray]:
-        if not self._sensors:
-            return {}
         if self._lost:  # so that all are numbers
             state = state.copy()
             for b in self._lost:
@@ -376,14 +364,6 @@ class Scenes:
         colours = np.zeros((len(self), len(simulation.scene.phase), 3))
         end = SnapshotBatch(state, simulation.dimension, colours, moment)
         return {name: np.array([value_of(sensor, one) for one in end]) for name, sensor in self._sensors.items()}
-
-    def _free(self, state: State, name: str) -> NDArray:
-        """Return position, cosine and sine of the angle, velocity and angular velocity of a free body (scenes, 7)."""
-        fields = position_name(name), f"{name}.{AXES[0]}", velocity_name(name)
-        place, axis, velocity = (state[field].numpy()[:, :2] for field in fields)
-        rate = state[angular_velocity_name(name)].numpy()[:, None]
-        place = self._domain.wrapped(place)
-        return np.concatenate([place, axis + [1.0, 0.0], velocity, rate], axis=1)
 
 
 def _made_again(given: tuple[Any, ...], saved: EnvState) -> Scenes:

@@ -19,8 +19,7 @@ from cortado.simulation import Simulation
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """An actuator sets some components of a parameter over time. Its command is ``greatest`` times the action, and is
-    interpolated linearly between environment steps."""
+    """An actuator sets components of a parameter to actions times ``greatest``, interpolated linearly in steps."""
 
     parameter: str
     """Name of the driven parameter, such as "cup.displacement"."""
@@ -35,8 +34,7 @@ class Actuator(ABC):
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """Return the driven components (..., a) after one simulation step, given the components ``q`` before
-        the step."""
+        """Return the driven components (..., a) after one simulation step from the components ``q``."""
 
     def at_rest(self, members: int) -> NDArray:
         """Return the driven components and the commands before any action (members, 2, a)."""
@@ -44,8 +42,7 @@ class Actuator(ABC):
 
     def advance(self, now: NDArray, u: NDArray, steps: int, time_step: float) -> tuple[NDArray, NDArray]:
         """Take ``steps`` simulation steps with actions ``u`` (members, a). Return the final components and commands
-        (members, 2, a), and the parameter after each step. The parameter is (members, steps, d), or (members, steps)
-        for a scalar."""
+        (members, 2, a), and the parameter after each step. The parameter is (members, steps, d) or (members, steps)."""
         driven, last = [now[:, 0]], now[:, 1]
         wanted = np.array(self.greatest) * u
         for j in range(steps):
@@ -73,8 +70,7 @@ class Actuator(ABC):
 
 @dataclass(frozen=True)
 class Velocity(Actuator):
-    """An actuator with velocities as actions. The command is the time derivative of the driven component. ``greatest``
-    is in m/s or rad/s."""
+    """An actuator with velocities as actions, in m/s or rad/s: the command is the driven component's derivative."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step * command
@@ -82,8 +78,7 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """An actuator with target values as actions. The driven component approaches the command exponentially with the
-    time constant ``lag``."""
+    """An actuator with target values as actions: the driven component approaches them with the time ``lag``."""
 
     lag: float = 0.1
     """Time constant of the actuator [s]."""
@@ -94,8 +89,7 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """The base class of control tasks. A task has a scene, actuators, a reward and goals, in a small and a
-    large size."""
+    """The base class of control tasks: a scene, actuators, a reward and goals, in a small and a large size."""
 
     size: str = "small"
     """"small", for a CPU, or "large", for a GPU. The large size has `finer` times as many particles along each axis."""
@@ -167,11 +161,8 @@ class Task(ABC):
         return np.zeros(0), np.zeros(0)
 
     def scene_of(self, **tables: Any) -> Scene:
-        common: dict[str, Any] = {
-            "name": self.name,
-            "discretisation": {"spacing": self.spacing},
-            "solver": {"time_step": self.time_step},
-        }
+        common: dict[str, Any] = {"name": self.name, "discretisation": {"spacing": self.spacing}}
+        common["solver"] = {"time_step": self.time_step}
         return Scene(dimension=self.dimension, **{**common, **tables})
 
 
@@ -180,16 +171,14 @@ def checked_scene(task: Task) -> Scene:
     scene = task.scene
     found, wanted = scene.solver.time_step, task.time_step
     if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):
-        raise InputError(
-            f"the scene of the task {task.name} has solver.time_step = {shown(found)}, but must have the "
-            f"time_step of the task, {wanted:g} s, with which its actuators compute."
-        )
+        own = f"the time_step of the task, {wanted:g} s, with which its actuators compute"
+        said = f"the scene of the task {task.name} has solver.time_step = {shown(found)}"
+        raise InputError(f"{said}, but must have {own}.")
     return scene
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return actions clipped to the range from -1 to 1. Raises `InputError` for a wrong shape and for values that are
-    not finite."""
+    """Return actions clipped to -1 to 1. Raises `InputError` for a wrong shape and for values that are not finite."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")

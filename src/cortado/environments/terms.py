@@ -94,8 +94,7 @@ class OverParticles:
         return total(value.flatten()).numpy() / self._over(at)
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
-        """Add ``factor`` times the derivative of the term to ``bar``. ``others`` are further output arrays of the
-        kernel."""
+        """Add ``factor`` times the derivative of the term to ``bar``. ``others`` are further outputs of the kernel."""
         scaled = _reals(at, factor / self._over(at))
         self._launch(f"{self.kernel}_adjoint", at, factor=scaled, x_bar=bar.positions, **others)
 
@@ -128,8 +127,7 @@ class Share(OverParticles):
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes and the width of their smooth boundary [m]. If a ``solid`` is given, the boxes move and turn
-        with the solid. In 3-D they turn only about z."""
+        """Set the boxes and their width [m]. With a ``solid`` they move, and turn about z alone."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -165,8 +163,7 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` over all pairs of chosen particles, divided by ``everywhere``.
-    Distances are to the nearest periodic images."""
+    """A reward term: the mean distance ``|dx| + |dy|`` of chosen particles' nearest images, over ``everywhere``."""
 
     kernel = "apart"
 
@@ -188,8 +185,7 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """A reward term: the weighted sum of squared distances of particles from targets, which change from step to step.
-    The targets have no periodic images."""
+    """A reward term: the weighted sum of squared distances from targets of each step, without periodic images."""
 
     kernel = "missed"
 
@@ -262,9 +258,6 @@ class Reward:
     constant: float = 0.0
     domain: Domain = WITHOUT_PERIODS
 
-    def at(self, state: State, goal: NDArray, step: NDArray) -> StepEnd:
-        return StepEnd(state, goal, step, self.domain)
-
     @WARP
     def values(self, at: StepEnd) -> NDArray:
         """Return the reward of each scene (scenes,)."""
@@ -310,12 +303,11 @@ class MinusReward:
     def _at(self, end: Any) -> StepEnd:
         scenes = end.state.batch or 1
         goal = np.broadcast_to(self.goal, (scenes, self.goal.shape[1]))
-        return self.reward.at(end.state, goal, np.full(scenes, self.step))
+        return StepEnd(end.state, goal, np.full(scenes, self.step), self.reward.domain)
 
 
 def _miss(at: StepEnd, solid: str) -> NDArray:
-    """Return the distance from the goal to the centre of a solid along the first axis (scenes,) [m], to the nearest
-    periodic image."""
+    """Return the distance of a solid's nearest periodic image from the goal along the first axis (scenes,) [m]."""
     return apart(_numbers(at.state, position_name(solid))[:, :1] - at.goal[:, :1], at.domain.lengths[:1])[:, 0]
 
 
@@ -324,9 +316,8 @@ def _reals(at: StepEnd, values: NDArray) -> wp.array:
 
 
 def _vectors(at: StepEnd, values: NDArray) -> wp.array:
-    return to_device(values.reshape(-1, values.shape[-1]), precision_of(at.state), at.state.positions.device).reshape(
-        values.shape[:-1]
-    )
+    flat, device = values.reshape(-1, values.shape[-1]), at.state.positions.device
+    return to_device(flat, precision_of(at.state), device).reshape(values.shape[:-1])
 
 
 def _numbers(state: State, name: str) -> NDArray:

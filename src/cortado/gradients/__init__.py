@@ -11,36 +11,17 @@ the loss. `RandomizedSmoothing` needs only forward runs, and is the reference fo
 from cortado.arrays import require_function, require_methods
 from cortado.calls import face
 from cortado.gradients.ensembles import EnsembleMean, Guided, RandomizedSmoothing
-from cortado.gradients.estimator import (
-    AdjointEstimator,
-    Differentiable,
-    Estimate,
-    Filtered,
-    ForwardPass,
-    GradientEstimator,
-    checked_estimate,
-    checked_estimator,
-)
+from cortado.gradients.estimator import AdjointEstimator as AdjointEstimator
+from cortado.gradients.estimator import Differentiable, Estimate, GradientEstimator, checked_estimate, checked_estimator
+from cortado.gradients.estimator import Filtered as Filtered
+from cortado.gradients.estimator import ForwardPass as ForwardPass
 from cortado.gradients.reverse_mode import AdjointNorms, AdjointViscosity, Exact, Tape
 from cortado.rollout.rollout import OBSERVED, Observer
 from cortado.scene.parameter_values import Values
 
-__all__ = [
-    "AdjointEstimator",
-    "AdjointNorms",
-    "AdjointViscosity",
-    "Differentiable",
-    "EnsembleMean",
-    "Estimate",
-    "Exact",
-    "Filtered",
-    "ForwardPass",
-    "GradientEstimator",
-    "Guided",
-    "RandomizedSmoothing",
-    "Tape",
-    "estimate",
-]
+__all__ = ["AdjointEstimator", "AdjointNorms", "AdjointViscosity", "Differentiable", "EnsembleMean", "Estimate"]
+__all__ += ["Exact", "Filtered", "ForwardPass", "GradientEstimator", "Guided", "RandomizedSmoothing", "Tape"]
+__all__ += ["estimate"]
 
 
 def estimate(

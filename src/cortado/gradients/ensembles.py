@@ -55,9 +55,8 @@ class Ensemble:
         require_at_most("samples", self.samples, MOST_SAMPLES)
         position_noise = as_number(self.position_noise)
         if position_noise is None or position_noise < 0.0:
-            raise InputError(
-                f"position_noise is {shown(self.position_noise)}, but must be a number of at least 0, in spacings."
-            )
+            said = f"position_noise is {shown(self.position_noise)}"
+            raise InputError(f"{said}, but must be a number of at least 0, in spacings.")
         require_whole("seed", self.seed, 0)
         for name, spread in self.spread.items() if isinstance(self.spread, Mapping) else [("parameters", self.spread)]:
             if (as_number(spread) or 0.0) <= 0.0:
@@ -69,16 +68,16 @@ class Ensemble:
         """Return the ensemble around the parameters of a problem. Each ``draw`` has independent samples. Raises
         `InputError` for a batch, for no parameters, and for spreads below round-off."""
         if problem.simulation.batch is not None:
-            raise InputError(
-                f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene, whose "
-                "samples it runs in batches of its own."
-            )
+            said = f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene"
+            raise InputError(f"{said}, whose samples it runs in batches of its own.")
         if not parameters:
             raise InputError(f"parameters is empty, but must name the parameters that {type(self).__name__} varies.")
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
-        widths = {name: self._spread(name) for name in values}
+        if lacking := [name for name in values if isinstance(self.spread, Mapping) and name not in self.spread]:
+            raise InputError(f"spread has nothing for {lacking[0]}, but must have a number for every parameter.")
+        given = self.spread if isinstance(self.spread, Mapping) else dict.fromkeys(values, self.spread)
+        widths, precision = {name: float(given[name]) for name in values}, problem.simulation.precision
         for name, value in values.items():
-            precision = problem.simulation.precision
             lost = np.asarray(value, precision.numpy) == np.asarray(value + widths[name], precision.numpy)
             if lost.any():  # all samples would be equal
                 wanted = f"large enough to change {value[lost].flat[0]:g} in {precision.name}"
@@ -90,17 +89,11 @@ class Ensemble:
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
         """Return the estimates at the points. With ``observe`` all runs are computed in this process."""
-        executor = self.executor if observe is None else InProcess()
-        return evaluated(problem, points, executor, observe)
+        return evaluated(problem, points, self.executor if observe is None else InProcess(), observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
         """Raise `InputError` unless the memory suffices for ``runs`` results with ``numbers`` components each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
-
-    def _spread(self, name: str) -> float:
-        if isinstance(self.spread, Mapping) and name not in self.spread:
-            raise InputError(f"spread has nothing for {name}, but must have a number for every parameter.")
-        return float(self.spread[name] if isinstance(self.spread, Mapping) else self.spread)
 
 
 @dataclass(frozen=True)
@@ -128,8 +121,7 @@ class Sampler:
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Point:
-        """Return a sample with changed parameters and displaced initial positions. ``u`` (numbers,) is the change of
-        the parameters, in units of the spreads."""
+        """Return a sample with parameters moved by ``u`` (numbers,) spreads, and with displaced initial positions."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
@@ -209,10 +201,9 @@ class RandomizedSmoothing(Ensemble):
         ensemble = self.around(problem, parameters)
         numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
-            raise InputError(
-                f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}, as the simulation "
-                "is run twice for each: take fewer, such as one gravity for all steps, or another estimator."
-            )
+            said = f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}"
+            advice = "take fewer, such as one gravity for all steps, or another estimator"
+            raise InputError(f"{said}, as the simulation is run twice for each: {advice}.")
         self.require_memory(2 * numbers * self.samples, numbers)
         directions, r = [], np.sqrt(numbers)
 
@@ -247,8 +238,7 @@ class EnsembleMean(Ensemble):
     do not average `Exact` gradients, because the largest few dominate the mean.
 
     Bias: the estimator's bias. The perturbations of the initial positions add a bias if the loss is as small as their
-    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients of the estimator and one
-    forward run.
+    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients and one forward run.
 
     Samples that diverge: the whole antithetic pair is left out, up to a quarter of all pairs. The remaining samples are
     symmetric about the parameters, so that the mean is not shifted.
@@ -291,20 +281,17 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean gradient (numbers,) and its standard error, given gradients (samples, numbers). Antithetic
-        pairs are adjacent."""
+        """Return the mean of gradients (samples, numbers) of adjacent antithetic pairs, and its standard error."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
 def require_pairs(samples: int) -> None:
-    """Raise `InputError` unless there are at least two antithetic pairs of samples."""
     if samples % 2 or samples < 4:
         raise InputError(f"samples is {shown(samples)}, but must be an even number of at least 4.")
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the samples and its standard error, without overflow. Components with infinite numbers give
-    NaN."""
+    """Return the mean of the samples and its standard error, without overflow, or NaN for infinite samples."""
     size = np.abs(samples).max(initial=0.0)
     unit = size if 0.0 < size < np.inf else 1.0
     with np.errstate(invalid="ignore"):
@@ -312,7 +299,6 @@ def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def joined(gradient: Arrays, names: Iterable[str]) -> np.ndarray:
-    """Return the gradient as one vector."""
     return np.concatenate([gradient[name].ravel() for name in names])
 
 
@@ -366,9 +352,8 @@ class Guided(Ensemble):
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
         """Return the loss and its gradient. ``observe`` is called with the adjoints of the surrogate's samples."""
         ensemble = self.around(problem, parameters, draw=1)
-        surrogate = EnsembleMean(
-            self.spread, self.samples, self.position_noise, self.seed, self.surrogate, executor=self.executor
-        ).estimate(problem, parameters, observe)
+        own = self.spread, self.samples, self.position_noise, self.seed, self.surrogate
+        surrogate = EnsembleMean(*own, executor=self.executor).estimate(problem, parameters, observe)
         assert surrogate.standard_error is not None and surrogate.degrees_of_freedom is not None
         parts, turns = self._parts(ensemble, surrogate.gradient, surrogate.standard_error)
         self.require_memory(2 * self.differences * len(parts), 0)
@@ -389,40 +374,26 @@ class Guided(Ensemble):
         along, across = (np.reshape(rows, (-1, len(ensemble.spreads))) for rows in (parts, turns))
         errors = np.array([size_errors @ np.abs(along), np.abs(sizes) @ across])
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in (sizes @ along, np.hypot(*errors)))
-        freedom = _freedom(errors, (len(pairs) - 1, surrogate.degrees_of_freedom))
+        shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
+        freedoms = len(pairs) - 1, surrogate.degrees_of_freedom
+        freedom = float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))  # of a sum of errors (Welch 1947)
         left_out = surrogate.left_out + len(runs) // self.differences * int(np.count_nonzero(~kept))
         return Estimate(surrogate.loss, gradient, error, freedom, surrogate.mean_loss, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the scaled parts of a gradient, as directions (numbers,) of length 1, and their standard errors. Parts
-        with zero gradient are left out."""
-        places = np.concatenate([_places(value, self.parts) for value in ensemble.values.values()])
-        firsts = np.cumsum([0, *(value.size for value in ensemble.values.values())])
-        places += self.parts * np.repeat(np.arange(len(firsts) - 1), np.diff(firsts))
+        """Return the directions (numbers,), of length 1, and errors of the parts of a gradient that are not 0."""
+        numbers = []  # of the part of each component
+        for k, value in enumerate(ensemble.values.values()):
+            rows = len(value) if value.ndim > 1 else 1
+            numbers.append(self.parts * k + np.repeat(np.arange(rows) * self.parts // rows, value.size // rows))
+        places = np.concatenate(numbers)
         whole, errors = (ensemble.spreads * joined(one, ensemble.values) for one in (gradient, error))
         greatest = np.abs(whole).max()
         if not np.isfinite(greatest):
-            raise ComputationError(
-                f"The gradient of {self.surrogate!r} is not finite, so that Guided has no direction; take another "
-                "surrogate, or fewer steps."
-            )
+            said = f"The gradient of {self.surrogate!r} is not finite, so that Guided has no direction"
+            raise ComputationError(f"{said}; take another surrogate, or fewer steps.")
         whole, errors = (one / (greatest or 1.0) for one in (whole, errors))  # so that no square overflows
         lengths = {k: np.linalg.norm(whole[places == k]) for k in np.unique(places)}
-        parts, turns = (
-            [np.where(places == k, one, 0.0) / length for k, length in lengths.items() if length]
-            for one in (whole, errors)
-        )
+        there = [(places == k, length) for k, length in lengths.items() if length]
+        parts, turns = ([np.where(own, one, 0.0) / size for own, size in there] for one in (whole, errors))
         return parts, turns
-
-
-def _places(value: np.ndarray, parts: int) -> np.ndarray:
-    """Return the number of the part for each component of a parameter (size,). It is 0 for a vector or a number."""
-    rows = len(value) if value.ndim > 1 else 1
-    return np.repeat(np.arange(rows) * parts // rows, value.size // rows)
-
-
-def _freedom(errors: np.ndarray, freedoms: tuple[float, float]) -> float:
-    """Return the degrees of freedom of the sum of two errors (2, numbers) with given degrees of freedom (Welch
-    1947)."""
-    shares = (errors**2).sum(axis=1) / max((errors**2).sum(), np.finfo(float).tiny)
-    return float(1.0 / max((shares**2 / freedoms).sum(), 1.0 / sum(freedoms)))

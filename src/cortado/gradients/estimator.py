@@ -1,7 +1,7 @@
 """Protocols and results of gradient estimators, and the evaluation of a problem at many points."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, islice
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -34,12 +34,10 @@ class Estimate:
     left_out: int = 0
     """Number of runs missing from the average. They failed, or their antithetic partners failed."""
     diverged: Exception | None = None
-    """Error of a failed point of `cortado.evaluate`: a `DivergedError` or an `OutOfRangeError`. Loss and gradient are
-    then NaN."""
+    """Error of a failed point of `cortado.evaluate` (`NO_RUN`), whose loss and gradient are NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
-        """Return the lower and the upper end of a confidence interval for each component of the gradient, by parameter
-        name.
+        """Return the lower and the upper ends of confidence intervals for the gradient, by parameter name.
 
         With the probability ``confidence`` the interval contains the estimator's mean over infinitely many samples, by
         Student's t-distribution. The interval does not include the estimator's bias.
@@ -78,8 +76,7 @@ class ForwardPass(Protocol):
         """Loss of the run."""
 
     def back(self, estimator: "AdjointEstimator", observe: Observer | None = None) -> Arrays:
-        """Return the gradient by an estimator. ``observe`` is called with the number and the adjoint of each state,
-        beginning with the last state."""
+        """Return the gradient by an estimator. ``observe`` sees each state's number and adjoint, from the last."""
 
 
 class Differentiable(Protocol):
@@ -99,8 +96,7 @@ class Batchable(Protocol):
     """Protocol of a problem that can be evaluated at many points together."""
 
     def room(self, estimator: "AdjointEstimator | None" = None) -> int:
-        """Return the greatest number of points in a call of `together`. Without an estimator only losses are
-        computed."""
+        """Return the greatest number of points for `together`. Without an estimator only losses are computed."""
 
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
@@ -124,7 +120,6 @@ def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
 
 
 def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
-    """Return the estimator. Raises `InputError` unless the estimator is an `AdjointEstimator`."""
     if not isinstance(estimator, AdjointEstimator):
         wanted = "an AdjointEstimator such as cortado.gradients.Exact()"
         raise InputError(f"estimator is {shown(estimator)}, but must be {wanted}.")
@@ -154,8 +149,7 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """True if the estimator can differentiate batches. Override this property if the estimator never mixes
-        scenes."""
+        """True if the estimator can differentiate batches. Override this property if it never mixes scenes."""
         return False
 
     @abstractmethod
@@ -176,8 +170,7 @@ class Filtered:
     """A backward step that also filters the adjoint. It wraps the backward step of a given estimator."""
 
     only_launches: ClassVar[bool] = False
-    """True if `filter` always launches the same kernels and does nothing else. A CUDA graph can then capture the
-    backward step."""
+    """True if `filter` only ever launches the same kernels, so that a CUDA graph can capture the backward step."""
 
     def __init__(self, base: BackwardStep):
         self._base, self.rollout, self.solver = base, base.rollout, base.solver
@@ -213,8 +206,7 @@ class Point:
     errors: tuple[type[Exception], ...] = ()
     """Errors that are replaced by a substitute loss."""
     is_sample: bool = False
-    """True for a random sample of an ensemble. Its estimate is not checked, and an `InputError` mentions that it is a
-    sample."""
+    """True for a sample of an ensemble. Its estimate is not checked, and an `InputError` says that it is a sample."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         """Return the loss and the gradient at the point. Without an estimator the gradient is empty."""
@@ -231,7 +223,6 @@ class Point:
             raise
 
     def without_a_run(self, why: Exception) -> Estimate:
-        """Return the estimate of a failed point, with a gradient of NaN."""
         names = self.values if self.estimator is not None else ()
         gradient = {name: np.full(np.shape(self.values[name]), np.nan) for name in names}
         return Estimate(self.loss_if_diverged, gradient, diverged=why)
@@ -256,20 +247,8 @@ class Evaluation:
             found = self.problem.together([point.values for point in group], estimator)
         except InputError:
             return [point.evaluated(self.problem) for point in group]
-        return [
-            point.evaluated(self.problem) if isinstance(one, DivergedError) else one
-            for one, point in zip(found, group, strict=True)
-        ]
-
-    def groups(self, points: Iterable[Point], threads: Callable[[], int]) -> Iterator[Group]:
-        """Yield the points in order, in groups for one launch. The groups are small enough to keep all worker threads
-        busy."""
-        for (estimator, _), alike in groupby(points, _kind):
-            room = 1
-            if isinstance(self.problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
-                room = self.problem.room(estimator)
-            while group := tuple(islice(alike, max(room // max(threads(), 1), 1))):
-                yield group
+        each = zip(found, group, strict=True)
+        return [point.evaluated(self.problem) if isinstance(one, DivergedError) else one for one, point in each]
 
 
 def evaluated(
@@ -279,21 +258,27 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Compute estimates at points with an executor, and return them in order. Many points are evaluated in one
-    launch."""
-    evaluation, firsts = Evaluation(problem, observe), [0]
+    """Compute estimates at points with an executor, and return them in order. One launch evaluates many points."""
+    firsts = [0]
 
-    def groups() -> Iterator[Group]:
-        for group in evaluation.groups(points, executor.threads):
-            firsts.append(firsts[-1] + len(group))
-            yield group
+    def kind(point: Point) -> tuple[Any, ...]:
+        return point.estimator, {name: np.shape(value) for name, value in point.values.items()}
+
+    def groups() -> Iterator[Group]:  # for one launch, small enough to keep all worker threads busy
+        for (estimator, _), alike in groupby(points, kind):
+            room = 1
+            if isinstance(problem, Batchable) and isinstance(estimator, AdjointEstimator | None):
+                room = problem.room(estimator)
+            while group := tuple(islice(alike, max(room // max(executor.threads(), 1), 1))):
+                firsts.append(firsts[-1] + len(group))
+                yield group
 
     def tell(number: int, group: list[Estimate]) -> None:
         if on_result is not None:
             for k, one in enumerate(group):
                 on_result(firsts[number] + k, one)
 
-    return [one for group in executor.map(evaluation, groups(), tell) for one in group]
+    return [one for group in executor.map(Evaluation(problem, observe), groups(), tell) for one in group]
 
 
 def without_runs(errors: Sequence[Exception], of: str) -> str:
@@ -301,7 +286,3 @@ def without_runs(errors: Sequence[Exception], of: str) -> str:
     diverged = sum(isinstance(error, DivergedError) for error in errors)
     why = ["diverged"] * bool(diverged) + ["cannot be run"] * (diverged < len(errors))
     return f"{len(errors)} of {of} {' or '.join(why)}"
-
-
-def _kind(point: Point) -> tuple[Any, ...]:
-    return point.estimator, {name: np.shape(value) for name, value in point.values.items()}

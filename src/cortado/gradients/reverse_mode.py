@@ -129,8 +129,7 @@ class AdjointNorms:
         wp.copy(self._history, self._sum(self._squares), dest_offset=step * members, count=members)
 
     def numpy(self) -> np.ndarray:
-        """Return the norms of the adjoints of positions and velocities for every state, as (steps + 1, 2). A batch has
-        the shape (steps + 1, batch, 2)."""
+        """Return the norms of the adjoints of positions and velocities, (steps + 1, 2) or (steps + 1, batch, 2)."""
         norms = np.sqrt(self._history.numpy())
         return norms if self._layout.batch is None else norms.reshape(-1, self._layout.batch, 2)
 
@@ -156,8 +155,7 @@ class Exact(AdjointEstimator):
 class Tape(AdjointEstimator):
     """A gradient estimator: the exact adjoint by Warp's automatic differentiation of the forward kernels.
 
-    It serves as a check of `Exact`, is slower, and uses atomics on a GPU. It works only with the solver ``"pcisph"``
-    and raises an error for any other solver.
+    It serves as a check of `Exact`, is slower, uses atomics on a GPU, and works only with the solver ``"pcisph"``.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Tape())``
     """
@@ -250,8 +248,7 @@ class AdjointViscosity(AdjointEstimator):
     coefficient: float = 2.0
     """Coefficient of the viscosity, at least 0. With 0 the gradient is the same as that of `Exact`."""
     limit: float = 4.0
-    """Greatest length of a particle's adjoint vector, relative to the root mean square over all particles. Infinity
-    means no limit."""
+    """Greatest length of a particle's adjoint vector, relative to the root mean square; infinity for no limit."""
     order: int = 1
     """Order 1, or 2 for an extrapolation from two backward passes. Order 2 gives no derivatives with respect to the
     initial state, and no derivatives of a single backward step."""
@@ -275,8 +272,7 @@ class AdjointViscosity(AdjointEstimator):
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
-        """Return the gradient of a forward run's loss. For order 2, ``observe`` is called only in the pass with the
-        smaller coefficient."""
+        """Return the gradient of a forward run's loss. ``observe`` sees only the pass with the smaller coefficient."""
         once = replace(self, order=1)
         gradient = forward_pass.back(once, observe)
         if self.order == 1:

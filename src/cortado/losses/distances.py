@@ -65,19 +65,17 @@ class FinalPositions:
         return FinalPositions, (self.target,)
 
     def value(self, end: Snapshot) -> float:
-        return float(self._mean_squares(end)[0])
+        one: Any = end
+        return float(self.values(one)[0])
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, State]:
         return self.value(end), self._adjoint(end)
-
-    def values(self, end: SnapshotBatch) -> np.ndarray:
-        return self._mean_squares(end)
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
         return self.values(end), self._adjoint(end)
 
     @WARP
-    def _mean_squares(self, end: Snapshot | SnapshotBatch) -> np.ndarray:
+    def values(self, end: SnapshotBatch) -> np.ndarray:
         x, (target, total) = end.state.positions, self._made(end)
         squares = wp.empty(len(x), dtype=wp.float64, device=x.device)
         kernel, _ = matching_kernels(end.precision)
@@ -116,17 +114,12 @@ class CentreOfMass:
         self.fingerprint = _checksum(self.target, self._weights)
 
     def value(self, end: Snapshot) -> float:
-        return float((self._miss(end) ** 2).sum())
+        return self.value_and_adjoint(end)[0]
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        bar = 2.0 * self._shares(end)[:, None] * self._miss(end)
-        return self.value(end), (bar, np.zeros_like(end.velocities))
-
-    def _shares(self, end: Snapshot) -> np.ndarray:
-        return _shares(self._weights, end, "target", self.target)
-
-    def _miss(self, end: Snapshot) -> np.ndarray:
-        return self._shares(end) @ end.positions - self.target
+        shares = _shares(self._weights, end, "target", self.target)
+        miss = shares @ end.positions - self.target
+        return float((miss**2).sum()), (2.0 * shares[:, None] * miss, np.zeros_like(end.velocities))
 
 
 @fixed
@@ -142,13 +135,11 @@ class CentreOfMassAlong:
         self.fingerprint = _checksum(self.direction, self._weights)
 
     def value(self, end: Snapshot) -> float:
-        return float((self._slopes(end) * end.positions).sum())
+        return self.value_and_adjoint(end)[0]
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        return self.value(end), (self._slopes(end), np.zeros_like(end.velocities))
-
-    def _slopes(self, end: Snapshot) -> np.ndarray:
-        return _shares(self._weights, end, "direction", self.direction)[:, None] * self.direction
+        slopes = _shares(self._weights, end, "direction", self.direction)[:, None] * self.direction
+        return float((slopes * end.positions).sum()), (slopes, np.zeros_like(end.velocities))
 
 
 def _finite(what: str, value: Any) -> np.ndarray:
@@ -168,8 +159,7 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _shares(weights: np.ndarray | None, end: Snapshot, name: str, vector: np.ndarray) -> np.ndarray:
-    """Return the particles' masses divided by the total mass (n,). Raises `InputError` if the vector does not suit the
-    scene."""
+    """Return the masses divided by their sum (n,). Raises `InputError` if the vector does not suit the scene."""
     n = len(end.positions)
     if vector.shape != (end.dimension,):
         raise InputError(f"{name} has shape {vector.shape}, but must be {(end.dimension,)}.")
@@ -239,8 +229,7 @@ class Pictures(Protocol):
         """Return the picture (rows, columns, 3) of particles."""
 
     def adjoint(self, image_bar: np.ndarray) -> Any:
-        """Return derivatives with the names ``positions``, ``fractions`` and ``colours``, given the derivative with
-        respect to the last picture."""
+        """Return derivatives ``positions``, ``fractions`` and ``colours``, given that of the last picture."""
 
 
 @fixed
@@ -264,7 +253,17 @@ class Image:
         self.renderer, self.distance = renderer, SquaredDifference() if distance is None else distance
         wanted = "an object such as cortado.image_losses.Pyramid()"
         require_methods("distance", self.distance, ("value", "adjoint"), wanted)
-        self.target = _target_image(target, getattr(renderer, "shape", None))
+        self.target, shape = read_only("target", target), getattr(renderer, "shape", None)
+        if self.target.ndim != 3 or self.target.shape[2] != 3 or not self.target.size:
+            raise InputError(f"target has shape {self.target.shape}, but must be a picture (rows, columns, 3).")
+        if shape is not None and self.target.shape != shape:
+            found = f"target has shape {self.target.shape}"
+            raise InputError(f"{found}, but must have that of the renderer's pictures, {shape}.")
+        if not np.isfinite(self.target).all():
+            raise InputError("target has a value that is not finite, but must be made of finite numbers.")
+        check_light("target", target)
+        if self.target.min() < 0.0:
+            raise InputError(f"target has a value of {self.target.min():g}, but must be {LIGHT}; clip noise at 0.")
         parts = (self.distance.fingerprint, _checksum(self.target))
         self.fingerprint = " ".join((*parts, getattr(renderer, "fingerprint", "")))
 
@@ -286,25 +285,9 @@ class Image:
         return self.distance.value(image, self.target), SnapshotAdjoint(bar, found.colours)
 
 
-def _target_image(target: Any, shape: tuple[int, int, int] | None) -> np.ndarray:
-    """Return a float64 copy of a target picture (rows, columns, 3). Raises `InputError` for a wrong shape."""
-    image = read_only("target", target)
-    if image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise InputError(f"target has shape {image.shape}, but must be a picture (rows, columns, 3).")
-    if shape is not None and image.shape != shape:
-        raise InputError(f"target has shape {image.shape}, but must have that of the renderer's pictures, {shape}.")
-    if not np.isfinite(image).all():
-        raise InputError("target has a value that is not finite, but must be made of finite numbers.")
-    check_light("target", target)
-    if image.min() < 0.0:
-        raise InputError(f"target has a value of {image.min():g}, but must be {LIGHT}; clip noise at 0.")
-    return image
-
-
 @fixed
 class SensorMatch:
-    """A loss: the weighted sum of squared differences between a sensor's reading and a target. The differences are
-    divided by a scale.
+    """A loss: the weighted sum of squared differences between a sensor's reading and a target, divided by a scale.
 
     Example::
 
@@ -332,16 +315,14 @@ class SensorMatch:
         found = value_of(self.sensor, end)
         if found.shape != self.target.shape:
             columns = ", ".join(self.sensor.columns(end.dimension))
-            raise InputError(
-                f"values has {len(self.target)} columns, but must have {len(found)}, those of the sensor: {columns}."
-            )
+            said = f"values has {len(self.target)} columns"
+            raise InputError(f"{said}, but must have {len(found)}, those of the sensor: {columns}.")
         return np.where(np.isnan(self.target), 0.0, found - self.target) / self.scale
 
 
 @fixed
 class Series(Frames):
-    """A loss: the mean over steps of the squared difference between a sensor's readings and a measured series. The
-    squared differences are summed over columns.
+    """A loss: the mean over steps of the squared differences between a sensor's columns and a measured series.
 
     The series is interpolated linearly to the times of the steps. Steps before the first time or after the last time of
     the series are ignored.
@@ -366,9 +347,8 @@ class Series(Frames):
             raise InputError("values must be finite, or NaN for values to ignore, but not all NaN.")
         columns, sizes = series.shape[1], as_numbers("scale", scale)
         if sizes.shape not in ((), (columns,)):
-            raise InputError(
-                f"scale has shape {sizes.shape}, but must be a number or ({columns},), one for each column."
-            )
+            said = f"scale has shape {sizes.shape}"
+            raise InputError(f"{said}, but must be a number or ({columns},), one for each column.")
         if not (sizes > 0.0).all():
             raise InputError("scale must be greater than 0.")
         step, stride = as_one_number("time_step", time_step), whole_number("every", every, 1)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol, overload, runtime_checkable
+from typing import Any, Protocol, overload
 
 import numpy as np
 
@@ -47,8 +47,7 @@ class OnHost:
 
     @cached_property
     def mass_fractions(self) -> np.ndarray:
-        """Mass fractions of the particles [-], as a read-only float64 array (n, phases), or (batch, n, phases) for a
-        batch."""
+        """Mass fractions of the particles [-], a read-only float64 array (n, phases), or (batch, n, phases)."""
         return self._field("mass_fractions")
 
     def _field(self, name: str) -> np.ndarray:
@@ -57,8 +56,7 @@ class OnHost:
 
 @dataclass(frozen=True)
 class Snapshot(OnHost):
-    """A state of a rollout, usually the last state, as NumPy and Warp arrays. Particles have the order of the initial
-    particles."""
+    """A state of a rollout, usually the last one, as NumPy and Warp arrays, in the order of the initial particles."""
 
     state: State
     """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields of the solver."""
@@ -89,8 +87,7 @@ class Snapshot(OnHost):
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Tables of the scene's solids in their initial positions. The current positions of moving solids are in the
-        state."""
+        """Tables of the scene's solids in their initial positions. The positions of moving solids are in the state."""
         return moment_of(self).evaluator().solids
 
     @property
@@ -112,8 +109,7 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """Return the state and parameters from which particle quantities are computed. Raises `InputError` if they are
-    unknown."""
+    """Return the state and parameters of which quantities are computed. Raises `InputError` if they are unknown."""
     if end.moment is None:
         raise InputError("The state has no simulation, with which quantities are computed: take a state of a run.")
     return end.moment
@@ -126,8 +122,7 @@ class StepBar:
     row: int
     """Number of the step in the run, counted from 0."""
     parameters: Mapping[str, np.ndarray]
-    """Derivatives by parameter name. Parameters over time have one entry for the step. In a batch the first axis is the
-    scene."""
+    """Derivatives by parameter name, for one step. In a batch the first axis is the scene."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -144,8 +139,7 @@ class SnapshotAdjoint:
     """Derivatives with respect to the parameters of the next step, computed by `through_quantities`."""
 
     def through_quantities(self, end: "Snapshot | SnapshotBatch") -> "SnapshotAdjoint":
-        """Convert derivatives with respect to particle quantities, by the chain rule, to derivatives with respect to
-        the state and the parameters."""
+        """Convert derivatives with respect to quantities to derivatives with respect to state and parameters."""
         if not self.quantities:
             return self
         moment = moment_of(end)
@@ -191,19 +185,14 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
     the loss. The result has the shape ``leading``, which is (batch,) for a batch. Missing names count as 0."""
     arrays = by_field(bar, np.shape(dots["positions"])[-1])
     arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
-    products = [
-        array.astype(np.float64) * np.asarray(dots[name], dtype=np.float64)
-        for name, array in arrays.items()
-        if name in dots
-    ]
-    return sum((each.reshape(*leading, -1).sum(axis=-1) for each in products), np.zeros(leading))
+    pairs = [(array.astype(np.float64), np.asarray(dots[n], np.float64)) for n, array in arrays.items() if n in dots]
+    return sum(((bar * dot).reshape(*leading, -1).sum(axis=-1) for bar, dot in pairs), np.zeros(leading))
 
 
 class Loss(Protocol):
     """Protocol of a loss, which is a differentiable number computed from the last state of a trajectory.
 
-    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`. The method returns only the
-    derivatives.
+    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`, for the derivatives alone.
     """
 
     def value(self, end: Snapshot) -> float:
@@ -244,8 +233,7 @@ class Frames:
 
 
 def fingerprint(loss: Any) -> str:
-    """Return a text that identifies a ``loss``. It comes from the loss's method ``fingerprint``, from the code of a
-    function, or from the name of the type.
+    """Return a text that identifies a ``loss``: its ``fingerprint``, its code, or the name of its type.
 
     Example: ``print(cortado.losses.fingerprint(cortado.losses.CentreOfMass([1.0, 0.2])))``
     """
@@ -305,16 +293,3 @@ class _Member(Snapshot):
 
     def _field(self, name: str) -> np.ndarray:
         return self.batch.on_host[name][self.number]
-
-
-@runtime_checkable
-class BatchedLoss(Protocol):
-    """Protocol of a loss that is computed for all scenes of a batch together. The results must have the same bits as
-    for single scenes."""
-
-    def values(self, end: SnapshotBatch) -> np.ndarray:
-        """Return the losses (batch,). The loss of a lost scene is arbitrary."""
-
-    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays. To make them, call
-        ``end.state.like()`` for zeros, and then ``set({"positions": array})`` with an array (batch, n, d)."""

@@ -1,7 +1,7 @@
 """Check user-defined losses, and assign losses to states by the number of steps."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -10,17 +10,7 @@ from cortado.arrays import as_numbers, as_one_number, require_arguments
 from cortado.calls import fixed
 from cortado.device.threads import WARP
 from cortado.errors import InputError
-from cortado.losses.loss import (
-    ADJOINT_FIELDS,
-    Adjoint,
-    BatchedLoss,
-    Frames,
-    Snapshot,
-    SnapshotAdjoint,
-    SnapshotBatch,
-    bar_on_device,
-    moment_of,
-)
+from cortado.losses.loss import Adjoint, Frames, Snapshot, SnapshotAdjoint, SnapshotBatch, bar_on_device, moment_of
 from cortado.particles.state import State
 from cortado.runs.sensor import SensedScene
 from cortado.scene.parameters import check_readable
@@ -75,12 +65,11 @@ class Recorded:
         return loss, copies[0], copies[1]
 
 
-FORMS = tuple(name.replace("_", " ") for name in ADJOINT_FIELDS)
+FORMS = "positions", "velocities", "mass fractions"
 
 
 class CheckedLoss:
-    """A wrapper of a loss that checks values and derivatives. It calls ``adjoint`` if the loss has this method, or else
-    ``value_and_adjoint``."""
+    """A loss with checked values and derivatives. It calls ``adjoint`` if it exists, or else ``value_and_adjoint``."""
 
     def __init__(self, loss: Any):
         self._loss = loss
@@ -100,8 +89,7 @@ class CheckedLoss:
         return _among(members, [self.value(end[b]) for b in members], len(end))
 
     def values_and_adjoints(self, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
-        """Return the `values` and the derivatives with respect to the states. Derivatives of scenes outside ``members``
-        are 0."""
+        """Return the `values` and the derivatives with respect to the states, 0 for scenes outside ``members``."""
         found, state, colours = np.full(len(end), np.nan), end.state.like(), np.zeros_like(end.colours)
         quantities: dict[str, np.ndarray] = {}
         for b in members:
@@ -123,13 +111,24 @@ class CheckedLoss:
             return _checked_table(bar, end)
         if not isinstance(bar, (tuple, list, np.ndarray)) or len(bar) not in (2, 3):
             count = f" of {len(bar)}" if isinstance(bar, (tuple, list)) else ""
-            raise InputError(
-                f"the loss's adjoint is a {type(bar).__name__}{count}, but must be a tuple of two or three arrays, the "
-                f"derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}, or a State, or a SnapshotAdjoint."
-            )
+            each = f"the derivatives with respect to {', '.join(FORMS[:2])} and {FORMS[2]}"
+            forms = f"a tuple of two or three arrays, {each}, or a State, or a SnapshotAdjoint"
+            raise InputError(f"the loss's adjoint is a {type(bar).__name__}{count}, but must be {forms}.")
         wanted = (end.positions.shape, end.velocities.shape, end.mass_fractions.shape)
-        forms = (f"adjoint of {form}" for form in FORMS)
-        return tuple(_checked_share(*entry) for entry in zip(forms, bar, wanted, strict=False))
+        names = (f"adjoint of {form}" for form in FORMS)
+        return tuple(_checked_share(*entry) for entry in zip(names, bar, wanted, strict=False))
+
+
+@runtime_checkable
+class BatchedLoss(Protocol):
+    """Protocol of a loss that is computed for all scenes of a batch together, with the bits of single scenes."""
+
+    def values(self, end: SnapshotBatch) -> np.ndarray:
+        """Return the losses (batch,). The loss of a lost scene is arbitrary."""
+
+    def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
+        """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays. To make them, call
+        ``end.state.like()`` for zeros, and then ``set({"positions": array})`` with an array (batch, n, d)."""
 
 
 class CheckedBatchedLoss(CheckedLoss):
@@ -152,8 +151,7 @@ def _among(members: Sequence[int], values: Any, batch: int) -> np.ndarray:
 
 
 def as_loss(loss: Any) -> CheckedLoss:
-    """Wrap a loss or a function of Warp arrays, so that results are checked. Raises `InputError` for any other
-    object."""
+    """Wrap a loss or a function of Warp arrays, with checked results. Raises `InputError` for any other object."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object of this class.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
@@ -213,10 +211,8 @@ class LossesByStep(dict[int, CheckedLoss]):
         """Take a ``loss`` of the last state, or a `Frames` loss. Raises `InputError` for any other object, and for
         frames beyond ``steps``. If time steps are ``chosen`` during the run, frames at fixed times are errors too."""
         if chosen and getattr(loss, "time_step", None) is not None:
-            raise InputError(
-                f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be one of numbers of "
-                'steps, as solver.time_step is "auto".'
-            )
+            wanted = 'one of numbers of steps, as solver.time_step is "auto"'
+            raise InputError(f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be {wanted}.")
         by_step = loss.losses if isinstance(loss, Frames) else {steps: loss}
         for step in by_step:
             if step not in range(steps + 1):
@@ -236,12 +232,10 @@ class LossesByStep(dict[int, CheckedLoss]):
         return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Return the sum of the losses of the states in ``ends``, which are given by number of steps. For a batch the
-        shape is (batch,), and scenes outside ``going`` get NaN."""
+        """Return the sum of losses of states by number of steps: for a batch (batch,), with NaN outside ``going``."""
         self._check(ends)
-        return sum(
-            loss.value(ends[step]) if going is None else loss.values(ends[step], going) for step, loss in self.items()
-        )
+        each = ((ends[step], loss) for step, loss in self.items())
+        return sum(loss.value(end) if going is None else loss.values(end, going) for end, loss in each)
 
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
@@ -249,7 +243,7 @@ class LossesByStep(dict[int, CheckedLoss]):
         """Return the `total` of the losses and the derivatives with respect to the states, by number of steps."""
         self._check(ends)
         total: Any = 0.0
-        bars = {}
+        bars = dict[int, SnapshotAdjoint]()
         for step, loss in self.items():
             if going is None:
                 value, bar = loss.value_and_adjoint(ends[step])

@@ -105,9 +105,7 @@ class DatasetFolder:
         return max([int(self.metadata.get("runs", 0)), *(number + 1 for number in numbers)])
 
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
-        """Write the files for training, validation and tests if their runs differ from ``split``. Old files are
-        replaced after all new files are complete. If the disk is full, nothing changes and `ComputationError` is
-        raised."""
+        """Write the files whose runs differ from ``split``, or raise `ComputationError` and change nothing."""
         stale = {}
         for purpose, numbers in split.items():
             path = self.path(purpose)
@@ -120,10 +118,9 @@ class DatasetFolder:
         with sentences(self.out):
             needed = SPARE * sum(path.stat().st_size for path in sources)
             if (free := shutil.disk_usage(self.out).free) < needed:
-                raise ComputationError(
-                    f"{self.out} needs {needed / 1e9:.3g} GB to put its runs together, but the disk has "
-                    f"{free / 1e9:.3g} GB left; free some space, and give the same command again."
-                )
+                found = f"{self.out} needs {needed / 1e9:.3g} GB to put its runs together"
+                left = f"the disk has {free / 1e9:.3g} GB left"
+                raise ComputationError(f"{found}, but {left}; free some space, and give the same command again.")
             try:
                 for (path, temporary), numbers in zip(temporaries.items(), stale.values(), strict=True):
                     self._copy([self.runs[number] for number in numbers], path, temporary)
@@ -144,9 +141,8 @@ class DatasetFolder:
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
         except RuntimeError as problem:  # so HDF5 says that the disk refused
-            raise ComputationError(
-                f"{path} cannot be written, as the disk refuses; free some space, and give the same command again."
-            ) from problem
+            said = f"{path} cannot be written, as the disk refuses"
+            raise ComputationError(f"{said}; free some space, and give the same command again.") from problem
 
     def write_metadata(self, content: Mapping[str, Any]) -> None:
         write_atomically(self.out / METADATA, json.dumps(content, indent=2) + "\n")
@@ -156,8 +152,7 @@ class DatasetFolder:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], folder: DatasetFolder, runs: int
 ) -> dict[str, Any]:
-    """Return the metadata of a data set for LagrangeBench. ``split`` maps training, validation and tests to run
-    numbers."""
+    """Return the metadata of a data set for LagrangeBench. ``split`` has run numbers by their use."""
     frames, (origin, size, periods) = table.steps // table.write_every + 1, bounds_of(scene)
     every = [folder.runs[number].statistics for own in split.values() for number in own]
     train = [folder.runs[number].statistics for number in split["train"]]

@@ -96,17 +96,12 @@ class DatasetTable(Table):
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return the numbers of the runs for training, validation and tests. The use of a run does not depend on the
-        total number of runs."""
+        """Return the numbers of the runs for training, validation and tests. More runs do not change their use."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
-
-            def lacks(purpose: str, runs: int = number + 1) -> tuple[bool, float]:
-                there = len(found[purpose])
-                return parts[purpose] > 0.0 and not there, parts[purpose] * runs - there
-
-            found[max(parts, key=lacks)].append(number)
+            lacks = {p: (part > 0.0 and not found[p], part * (number + 1) - len(found[p])) for p, part in parts.items()}
+            found[max(parts, key=lacks.__getitem__)].append(number)
         return found
 
 
@@ -141,18 +136,15 @@ class Sample:
     def start(self, positions: np.ndarray, velocities: np.ndarray, spacing: float) -> dict[str, np.ndarray]:
         """Return noisy initial positions [m] and velocities [m/s] (n, d) by name. Arrays without noise are left out."""
         random, found = self._random(1), {}
-        for name, array, size in (
-            ("initial_positions", positions, self.table.position_noise * spacing),
-            ("initial_velocities", velocities, self.table.velocity_noise),
-        ):
+        sizes = self.table.position_noise * spacing, self.table.velocity_noise
+        for name, array, size in zip(FIRST, (positions, velocities), sizes, strict=True):
             noise = random.standard_normal(array.shape)
             if size:
                 found[name] = array + size * noise
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Return a random direction of the initial state by name. ``sizes`` are the standard deviations for positions
-        [m] and velocities [m/s]."""
+        """Return a random direction of the initial state by name, with the standard deviations ``sizes`` [m, m/s]."""
         random = self._random(2, which)
         return {name: size * random.standard_normal(shape) for name, size in zip(FIRST, sizes, strict=True)}
 
@@ -182,16 +174,16 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
     start = sample.start(simulation.positions, simulation.velocities, scene.discretisation.spacing)
     trajectory = simulation.run(table.steps, start, record_every=table.write_every)
     origin, _, periods = bounds_of(scene)
-    positions = np.asarray(trajectory.positions, dtype=np.float64)
-    walls, wall_kinds = _walls(simulation, trajectory.solids, len(positions) if table.walls else 0)
+    positions, real = np.asarray(trajectory.positions, dtype=np.float64), simulation.precision.numpy
     phases = simulation.mass_fractions.argmax(axis=1)
-    kinds = np.where(phases == 0, FLUID, MORE_FLUID - 1 + phases)
-    real = simulation.precision.numpy
-    every = np.concatenate([positions, walls], axis=1) if table.walls else positions
+    kinds, every = np.where(phases == 0, FLUID, MORE_FLUID - 1 + phases), positions
+    if table.walls:
+        walls, wall_kinds = _walls(simulation, trajectory.solids, len(positions))
+        kinds, every = np.concatenate([kinds, wall_kinds]), np.concatenate([positions, walls], axis=1)
     places = wrapped(every - origin, periods)
     arrays = {
         "position": wrapped(places.astype(real), periods.astype(real)),  # as rounding may reach the period
-        "particle_type": np.concatenate([kinds, wall_kinds]).astype(np.int64),
+        "particle_type": kinds.astype(np.int64),
         "velocity": np.asarray(trajectory.velocities, dtype=real),
         **{f"vary/{key}": np.array(value) for key, value in sample.values.items()},
     }
@@ -202,8 +194,7 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lower corner, the lengths and the periods of the bounds of a data set, each (d,) [m]. Periods are 0
-    along axes without a period.
+    """Return the lower corner, the lengths and the periods (or 0) of the bounds of a data set, each (d,) [m].
 
     Raises `InputError` without a container, or if particles wait far outside the container.
     """
@@ -215,19 +206,17 @@ def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         if (layers := emitter.supply(spacing)) > emitter.layers(spacing):
-            raise InputError(
-                f"emitter[{index}] has particles in reserve, but a data set has every particle from the start: a "
-                f"length of {layers * spacing:.4g} m has room for all of them, or take fewer steps."
-            )
+            found = f"emitter[{index}] has particles in reserve, but a data set has every particle from the start"
+            longer = f"a length of {layers * spacing:.4g} m has room for all of them"
+            raise InputError(f"{found}: {longer}, or take fewer steps.")
     room = np.where(periods > 0.0, 0.0, MARGIN * scene.discretisation.spacing)
     return ends[0] - room, ends[1] - ends[0] + 2.0 * room, np.asarray(periods, dtype=np.float64)
 
 
 def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: int) -> tuple[np.ndarray, np.ndarray]:
     places = np.repeat(np.asarray(simulation.walls, dtype=np.float64)[None], frames, axis=0)
-    kinds = np.full(len(simulation.walls) if frames else 0, WALL)
-    numbers = wall_numbers(simulation.scene.solid)
-    for name, motion in motions.items() if frames else ():
+    kinds, numbers = np.full(len(simulation.walls), WALL), wall_numbers(simulation.scene.solid)
+    for name, motion in motions.items():
         own = simulation.wall_solids == numbers[name]
         turns = [rotation_matrix(tuple(np.atleast_1d(turn))) for turn in motion.rotations]
         beside = places[0, own] - motion.positions[0]
@@ -242,10 +231,9 @@ def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) 
     positions (d,) [m]. Raises `InputError` if a position is below the bounds."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
-        raise InputError(
-            f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis} in frame "
-            f"{frame}, but must be within: they begin {MARGIN} spacings outside of the container."
-        )
+        found = f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis}"
+        within = f"must be within: they begin {MARGIN} spacings outside of the container"
+        raise InputError(f"{found} in frame {frame}, but {within}.")
     moved = np.diff(positions, axis=0)
     moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))  # to the nearest periodic image
     statistics: dict[str, Any] = {}

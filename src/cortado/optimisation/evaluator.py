@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ from cortado.gradients import Exact
 from cortado.gradients.ensembles import Ensemble, LeftOutWarning
 from cortado.gradients.estimator import Differentiable, Estimate, Point, evaluated
 from cortado.optimisation.optimisers import LineSearch
-from cortado.optimisation.search import Log, LoggedEvaluation, ParameterLayout, Vector
+from cortado.optimisation.search import Log, LoggedEvaluation, ParameterLayout, Search, Vector
 from cortado.rollout.rollout import Observer
 from cortado.scene.parameter_values import Values
 
@@ -59,8 +60,7 @@ class Record:
     replayed: bool
     """True if the evaluation comes from the checkpoint."""
     refused: int = 0
-    """Number of refused steps before this evaluation. A step is refused if its run diverges or its parameters are out
-    of range."""
+    """Number of refused steps before. A step is refused if its run diverges or its parameters are out of range."""
     left_out: int = 0
     """Number of failed runs that ensemble averages ignored so far, without replayed evaluations."""
 
@@ -70,8 +70,7 @@ class Record:
 
 @dataclass
 class Promises:
-    """A test of a search's gradients, which compares predicted and real changes of the loss between successive
-    evaluations.
+    """A test of a search's gradients, which compares predicted and real changes of the loss between evaluations.
 
     The change of a smooth loss is close to the predictions from the slopes at the two ends of a step, or between them.
     Steps with a change of sign of the slope are not tested, because they may cross a minimum.
@@ -94,52 +93,29 @@ class Promises:
         if self._best is None or evaluation.loss < self._best.loss:
             self._best = evaluation
 
-    def held(self, lower: Vector, upper: Vector, layout: ParameterLayout) -> str:
-        """Return a sentence on bounds that prevent a lower loss, or an empty string."""
-        if self._best is None:
-            return ""
-        best, gradient = self._best.parameters, self._best.gradient
-        outwards = ((best <= lower) & (gradient > 0.0)) | ((best >= upper) & (gradient < 0.0))
-        names = [name for name, marks in layout.unravel(np.where(outwards, 1.0, 0.0)).items() if marks.any()]
-        found = " and ".join(names) + (" is at a bound" if len(names) == 1 else " are at bounds")
-        return f" {found}, beyond which the loss falls further: widen them, if that makes sense." if names else ""
-
-    @property
-    def kept(self) -> tuple[int, int]:
-        """Return the number of steps with wrong gradients, and the number of tested steps."""
+    def doubt(
+        self, search: Search, estimator: object, optimiser: object, converged: bool, is_run: bool
+    ) -> tuple[bool, bool, str]:
+        """Return whether a search was misled, whether its loss stopped falling though no bound holds it, and sentences
+        with advice. ``estimator`` is None for the problem's gradient. ``is_run`` is True for a loss of a simulation."""
+        assert self._best is not None
+        x, gradient = self._best.parameters, self._best.gradient
+        outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
+        names = [name for name, marks in search.layout.unravel(np.where(outwards, 1.0, 0.0)).items() if marks.any()]
+        ends = " and ".join(names) + (" is at a bound" if len(names) == 1 else " are at bounds")
+        by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
         first, last, change = np.array(self.steps or np.zeros((0, 3))).T
         least, most = np.minimum(np.abs(first), np.abs(last)), np.maximum(np.abs(first), np.abs(last))
         felt = max(FELT * (max(self.losses) - min(self.losses)), ROUND_OFF * max(map(abs, self.losses)))
         tells = (np.sign(first) == np.sign(last)) & (np.maximum(most, np.abs(change)) > felt)
         along = np.sign(first) * change
-        broken = (along < least / WRONG) | (along > most * WRONG)
-        return int(np.count_nonzero(tells & broken)), int(np.count_nonzero(tells))
-
-    @property
-    def misled(self) -> bool:
-        broken, told = self.kept
-        return broken >= max(FEW, MISLED * told)
-
-    def stays(self, converged: bool) -> bool:
-        """Return True if the loss has stopped falling while it is still large. It then changed by less than `FELT` over
-        the last third of the evaluations."""
+        is_wrong = tells & ((along < least / WRONG) | (along > most * WRONG))
+        broken, told = int(np.count_nonzero(is_wrong)), int(np.count_nonzero(tells))
+        misled = broken >= max(FEW, MISLED * told) and (is_exact or not by_direction)
         best, before = min(self.losses), min(self.losses[: -max(len(self.losses) // 3, 1)], default=np.inf)
-        stopped = len(self.losses) >= LEAST and before - best < FELT * abs(best)
-        return best > FELT * self.losses[0] and (converged or stopped)
-
-    def doubt(
-        self, estimator: object, optimiser: object, converged: bool, is_run: bool, held: str
-    ) -> tuple[bool, bool, str]:
-        """Return whether a search was misled, whether its loss stopped falling, and sentences with advice.
-
-        ``estimator`` is None for the problem's gradient. ``converged`` is True if the optimiser converged. ``is_run``
-        is True if the loss belongs to a simulation. ``held`` is the sentence from `held`.
-        """
-        by_direction, is_exact = isinstance(optimiser, LineSearch), estimator is None or isinstance(estimator, Exact)
-        misled, stays = self.misled and (is_exact or not by_direction), not held and self.stays(converged)
-        to_try = ["another start"]
+        stopped = converged or (len(self.losses) >= LEAST and before - best < FELT * abs(best))
+        stays, to_try = not names and best > FELT * self.losses[0] and stopped, ["another start"]
         if misled:
-            broken, told = self.kept
             said = f" The gradient disagrees with what steps did: in {broken} of {told} that tell, the loss changed by"
             said += " less than a tenth of what it promised, or by more than ten times as much."
             if is_run and is_exact:
@@ -147,23 +123,22 @@ class Promises:
                 return misled, stays, f"{said} AdjointViscosity() and the optimiser LineSearch, or elsewhere."
             to_try += [] if is_run else ["differences, to check it"]
         elif stays:
-            said = f" The loss has stayed at {min(self.losses) / self.losses[0]:.0%} of the first one, maybe in a wrong"
-            said += " valley."
+            said = f" The loss has stayed at {best / self.losses[0]:.0%} of the first one, maybe in a wrong valley."
             to_try += ["fewer steps"] if is_run else []
             if is_run and is_exact:
                 pair = "the gradient AdjointViscosity() with the optimiser LineSearch"
                 said += f" Try {', or '.join(to_try)}; or {pair}, where certify says that the exact one is of no use."
                 return misled, stays, said
         else:
-            return misled, stays, held
+            held = f" {ends}, beyond which the loss falls further: widen them, if that makes sense."
+            return misled, stays, held if names else ""
         to_try += [] if by_direction else ["the optimiser LineSearch, which steps over dents"]
         return misled, stays, f"{said} Try {', or '.join(to_try)}."
 
 
 @dataclass
 class Evaluator:
-    """The objective function of the optimiser. It first replays logged evaluations, and then computes and logs new
-    ones."""
+    """The objective function of the optimiser. It replays logged evaluations, and then computes and logs new ones."""
 
     problem: Optimisable
     estimator: Any
@@ -181,8 +156,7 @@ class Evaluator:
     """Number of failed runs that ensemble averages ignored."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the ensemble's estimate, and count the failed runs that its averages ignore. Only the first failure
-        gives a warning."""
+        """Return the ensemble's estimate, and count the runs that it leaves out. Only the first gives a warning."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -194,32 +168,30 @@ class Evaluator:
         self.updates += 1
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
-        """Return the loss and its gradient (size,) at a vector (size,)."""
-        found = self._next(vector, self._compute)
+        found = self._next(vector, is_trial=False)
         if found is None:
-            raise InputError(
-                f"Of the former run's evaluations, which {self.log.fate}, one has an infinite loss, but must have a "
-                "finite one for this optimiser: give another checkpoint folder."
-            )
+            said = f"Of the former run's evaluations, which {self.log.fate}, one has an infinite loss"
+            raise InputError(f"{said}, but must have a finite one for this optimiser: give another checkpoint folder.")
         return found
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return the loss and its gradient at a vector, or None if the run fails. A failed run is logged with an
-        infinite loss."""
+        """Return the loss and its gradient at a vector, or None for a failed run, logged with an infinite loss."""
+        return self._next(vector, is_trial=True)
 
-        def computed(vector: Vector) -> LoggedEvaluation:
-            try:
-                return self._computed(vector)
-            except REFUSED:
-                return LoggedEvaluation(vector.copy(), math.inf, np.zeros_like(vector))
-
-        return self._next(vector, computed)
-
-    def _next(self, vector: Vector, compute: Callable[[Vector], LoggedEvaluation]) -> tuple[float, Vector] | None:
+    def _next(self, vector: Vector, is_trial: bool) -> tuple[float, Vector] | None:
         """Replay or compute the next evaluation. Evaluations with a finite loss are added to the history."""
         replayed = self.logged < len(self.log)
-        evaluation = self._replay(vector) if replayed else compute(vector)
-        if not replayed:
+        if replayed:
+            evaluation = self._replay(vector)
+        else:
+            try:
+                evaluation = self._computed(vector)
+            except REFUSED as error:
+                if not is_trial and self.history:
+                    raise self._with_advice(error, vector) from error
+                if not is_trial:
+                    raise
+                evaluation = LoggedEvaluation(vector.copy(), math.inf, np.zeros_like(vector))
             self.log.append(evaluation)
         self.logged += 1
         if not math.isfinite(evaluation.loss):
@@ -253,17 +225,11 @@ class Evaluator:
             self.log.append(LoggedEvaluation(left[len(found)].copy(), number, np.zeros_like(left[0])))
             found.append(number)
 
-        points, problem = [self.layout.unravel(vector) for vector in left], self.problem
-        if callable(getattr(problem, "value", None)):
-            made: Any = problem
-            trials = [Point(point, loss_if_diverged=math.inf, errors=REFUSED) for point in points]
-            evaluated(made, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
-        else:  # it always computes its gradient too
-            for point in points:
-                try:
-                    keep(self._evaluated(point)[0])
-                except REFUSED:
-                    keep(math.inf)
+        problem: Any = self.problem
+        if not callable(getattr(problem, "value", None)):  # it always computes its gradient too
+            problem = SimpleNamespace(value=lambda point: self._evaluated(point)[0])
+        trials = [Point(self.layout.unravel(vector), loss_if_diverged=math.inf, errors=REFUSED) for vector in left]
+        evaluated(problem, trials, InProcess(), on_result=lambda _, one: keep(one.loss))
         self.logged += len(vectors)
         return [loss if math.isfinite(loss) else math.inf for loss in (*known, *found)]
 
@@ -276,60 +242,42 @@ class Evaluator:
                 return found[0], found[1]
             words = f"a loss and a gradient of type {type(found[1]).__name__}" if pair else f"a {kind} of {len(found)}"
             found = Words(words)
-        raise InputError(
-            f"What is optimised returned {shown(found)}, but must return two things: the loss, a number, and its "
-            "gradient, a dictionary with an array for each parameter by its name."
-        )
+        said = f"What is optimised returned {shown(found)}, but must return two things: the loss, a number"
+        raise InputError(f"{said}, and its gradient, a dictionary with an array for each parameter by its name.")
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the next logged evaluation, or the evaluation that comes ``ahead`` places later. Raises `InputError`
-        if its vector differs."""
+        """Return a logged evaluation, ``ahead`` places after the next one. Raises `InputError` for another vector."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
-            raise InputError(
-                f"This run asks for evaluation {len(self.history)} at another {self._names_of(changed)} than "
-                "the run being resumed, so that its start, bounds, optimiser, machine or number of "
-                "threads differ; give the former ones, or another checkpoint folder. "
-                f"The former run's evaluations {self.log.fate}."
-            )
+            found = f"This run asks for evaluation {len(self.history)} at another {self._names_of(changed)}"
+            why = "its start, bounds, optimiser, machine or number of threads differ"
+            advice = f"give the former ones, or another checkpoint folder. The former run's evaluations {self.log.fate}"
+            raise InputError(f"{found} than the run being resumed, so that {why}; {advice}.")
         return evaluation
 
-    def _compute(self, vector: Vector) -> LoggedEvaluation:
-        """Evaluate the problem. Errors after the first evaluation include advice on the search."""
-        try:
-            return self._computed(vector)
-        except InputError as error:
-            if not self.history:
-                raise
-            raise ComputationError(
-                f"In evaluation {len(self.history)} the search tried impossible parameters: {error} Try a "
-                f"smaller learning rate, or bounds on the parameters. The {len(self.history)} evaluations before "
-                f"{self.log.fate}."
-            ) from error
-        except DivergedError as error:
-            if not self.history:
-                raise
-            best = min(self.history, key=lambda record: record.loss)
-            told = [f"{error.advice}, a smaller learning rate or scale, or bounds on the parameters"]
-            least = f"the least loss before is {best.loss:.4g}"
-            if vector.size <= 6:  # else the sentence is too long
-                told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
-                least = f"{least} at {_in_words(best.parameters)}"
-            raise error.with_advice("; ".join([*told, least])) from error
+    def _with_advice(self, error: DivergedError | InputError, vector: Vector) -> ComputationError:
+        if isinstance(error, InputError):
+            said = f"In evaluation {len(self.history)} the search tried impossible parameters: {error}"
+            advice = f"bounds on the parameters. The {len(self.history)} evaluations before {self.log.fate}"
+            return ComputationError(f"{said} Try a smaller learning rate, or {advice}.")
+        best = min(self.history, key=lambda record: record.loss)
+        told = [f"{error.advice}, a smaller learning rate or scale, or bounds on the parameters"]
+        least = f"the least loss before is {best.loss:.4g}"
+        if vector.size <= 6:  # else the sentence is too long
+            told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
+            least = f"{least} at {_in_words(best.parameters)}"
+        return error.with_advice("; ".join([*told, least]))
 
     def _computed(self, vector: Vector) -> LoggedEvaluation:
-        """Evaluate the problem. Raises an error for a gradient with wrong names or shapes, and for values that are not
-        finite."""
+        """Evaluate the problem. Raises an error for wrong names or shapes, or values that are not finite."""
         loss, gradients = self._evaluated(self.layout.unravel(vector))
         loss = as_one_number("The problem's loss", loss)
         wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
-            raise InputError(
-                f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}; a gradient "
-                "has the names and the shapes of the parameters."
-            )
+            said = f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}"
+            raise InputError(f"{said}; a gradient has the names and the shapes of the parameters.")
         gradient = self.layout.ravel({n: as_numbers(f"The gradient of '{n}'", gradients[n]) for n in wanted})
         broken = ~(np.abs(gradient) <= GREATEST_GRADIENT)
         if math.isfinite(loss) and not broken.any():
@@ -338,13 +286,11 @@ class Evaluator:
         if not math.isfinite(loss):
             what = f"the loss is {loss} as a function of {self._names_of(np.ones_like(broken))}"
         if not self.history:
-            raise ComputationError(
-                f"At the start {what}; begin elsewhere, look at the loss, or take a shorter horizon."
-            )
-        raise ComputationError(
-            f"In evaluation {len(self.history)} {what}; try a smaller learning rate, bounds on the "
-            f"parameters, or a shorter horizon. The {len(self.history)} evaluations before {self.log.fate}."
-        )
+            said = f"At the start {what}"
+            raise ComputationError(f"{said}; begin elsewhere, look at the loss, or take a shorter horizon.")
+        advice = "try a smaller learning rate, bounds on the parameters, or a shorter horizon"
+        kept = f"The {len(self.history)} evaluations before {self.log.fate}"
+        raise ComputationError(f"In evaluation {len(self.history)} {what}; {advice}. {kept}.")
 
     def _names_of(self, components: np.ndarray) -> str:
         marked = self.layout.unravel(components.astype(np.float64))

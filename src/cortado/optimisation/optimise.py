@@ -1,5 +1,4 @@
-"""Search for the parameters with the lowest loss (`cortado.optimise`), and compute losses at independent points
-(`cortado.evaluate`)."""
+"""Search for the parameters with the lowest loss (`optimise`), and compute losses at points (`evaluate`)."""
 
 import os
 import re
@@ -33,6 +32,7 @@ from cortado.scene.parameter_values import Values, require_points
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """A function that maps parameters by name to the loss and its gradient by name."""
+Bounds = Mapping[str, tuple[Any, Any]]
 MOST_ITERATIONS = 10_000_000
 """Greatest number of updates of a search."""
 
@@ -43,8 +43,7 @@ class Function:
 
     @property
     def fingerprint(self) -> str:
-        kind = type(self.function)
-        return str(getattr(self.function, "__qualname__", kind.__qualname__))
+        return str(getattr(self.function, "__qualname__", type(self.function).__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
         """Return the result of the function. Raises `InputError` if a gradient estimator is given."""
@@ -61,10 +60,8 @@ def as_differentiable(problem: Any) -> Optimisable:
         return problem
     if callable(problem):
         return Function(problem)
-    raise InputError(
-        f"What is optimised is {shown(problem)}, but must be a cortado.Problem, an object with value_and_gradient, or "
-        "a function of the parameters that returns its loss and its gradient."
-    )
+    said = f"What is optimised is {shown(problem)}, but must be a cortado.Problem, an object with value_and_gradient"
+    raise InputError(f"{said}, or a function of the parameters that returns its loss and its gradient.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,22 +83,18 @@ class Result:
     message: str
     """Sentence on how the search ended."""
     converged: bool
-    """True if the convergence test of the optimiser was met and `misled` is false. Only L-BFGS has a
-    convergence test."""
+    """True if the optimiser's convergence test was met and `misled` is false. Only L-BFGS has a convergence test."""
     refused: int = 0
-    """Number of refused steps, which are not in the history. A step is refused if its run diverges or if one of its
-    parameters is out of range."""
+    """Number of refused steps, whose run diverged or whose parameters were out of range, not in the history."""
     left_out: int = 0
-    """Number of runs that averages over ensembles left out, because the run diverged or a parameter was out of range.
-    Runs from the checkpoint do not count."""
+    """Number of runs that averages over ensembles left out, as for `refused`. Runs of the checkpoint do not count."""
     misled: bool = False
     """True if the gradient disagreed with the change of the loss. Do not trust the search then; `message` gives advice.
     Gradients are often wrong beyond the horizon of `cortado.certify`."""
     stays: bool = False
     """True if the lowest loss is still a large fraction of the first loss, as in a wrong local minimum."""
     problem: Any = field(default=None, repr=False)
-    """The optimised `Problem`, for pictures in notebooks. It is None for any other type of problem, and in pickled
-    results."""
+    """The optimised `Problem`, for pictures in notebooks. None for another type of problem, and in pickled results."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None}
@@ -132,16 +125,13 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
     return found
 
 
-def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], start: Mapping[str, Vector]) -> tuple[Any, Any]:
-    """Return lower and upper bounds by name. A missing bound is infinite. Raises `InputError` for bounds that do not
-    match the parameters or exclude the start."""
+def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, Vector]]:
+    """Return lower and upper bounds by name, infinite if missing. Raises `InputError` for bounds that do not fit."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
     if unknown := sorted(set(bounds) - set(start), key=str):
-        raise InputError(
-            f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name; the "
-            f"optimised parameters are {', '.join(map(repr, start))}."
-        )
+        said = f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name"
+        raise InputError(f"{said}; the optimised parameters are {', '.join(map(repr, start))}.")
     least, most = dict[str, Vector](), dict[str, Vector]()
     for name, value in start.items():
         pair = bounds.get(name, (None, None))
@@ -151,20 +141,18 @@ def checked_bounds(bounds: Mapping[str, tuple[Any, Any]], start: Mapping[str, Ve
             high = as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
             low, high = np.broadcast_to(low, value.shape), np.broadcast_to(high, value.shape)
         except (TypeError, ValueError):
-            raise InputError(
-                f"The bounds of '{name}' must be (lower, upper), each None, a number or an array of shape "
-                f"{value.shape}, not {pair!r}."
-            ) from None
+            said = f"The bounds of '{name}' must be (lower, upper), each None"
+            raise InputError(f"{said}, a number or an array of shape {value.shape}, not {pair!r}.") from None
         if not (low <= high).all():
             raise InputError(f"The lower bound of '{name}' must not exceed the upper one; neither may be NaN.")
         least[name], most[name] = low, high
     for name, value in start.items():
         outside = (value < least[name]) | (value > most[name])
         if outside.any():
-            raise InputError(
-                f"The start of '{name}' is outside of its bounds in {int(outside.sum())} of {outside.size} "
-                "components; start within the bounds, or widen them."
+            said = (
+                f"The start of '{name}' is outside of its bounds in {int(outside.sum())} of {outside.size} components"
             )
+            raise InputError(f"{said}; start within the bounds, or widen them.")
     return least, most
 
 
@@ -210,8 +198,7 @@ def evaluate(
         require_table("a point", values, "{'gravity': value}")
         return Point(values, estimator, loss, NO_RUN)
 
-    made = map(point, points)
-    found = evaluated(problem, made, chosen, on_result=on_result)
+    found = evaluated(problem, map(point, points), chosen, on_result=on_result)
     lost = {number: one.diverged for number, one in enumerate(found) if one.diverged is not None}
     if lost and loss_if_diverged is None:
         first, error = next(iter(lost.items()))
@@ -275,18 +262,16 @@ def optimise(
     require_truth("resume", resume)
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = checked_start(start)
-    layout = ParameterLayout.of(values)
+    layout = ParameterLayout(tuple(values), tuple(array.shape for array in values.values()))
     vector = layout.ravel(values)
     lower, upper = map(layout.ravel, checked_bounds({} if bounds is None else bounds, values))
     algorithm.check(layout)
     if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
         wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
         raise InputError(f"The number of iterations must be {wanted}, not {shown(iterations)}.")
-    identity = {
-        "optimiser": _description(algorithm),
-        "gradient": _description(gradient),
-        "problem": str(getattr(differentiable, "fingerprint", "")),
-    }
+    identity = {"optimiser": repr(algorithm), "gradient": repr(gradient)}
+    identity = {what: re.sub(r" at 0x[0-9a-fA-F]+", "", text) for what, text in identity.items()}
+    identity["problem"] = str(getattr(differentiable, "fingerprint", ""))
     if resume and checkpoint is None:
         raise InputError("resume=True needs the checkpoint folder of the run to resume; give checkpoint=...")
     own_log = MemoryLog() if checkpoint is None else ReplayLog(checkpoint, layout, identity, resume)
@@ -299,8 +284,7 @@ def optimise(
     why += [f"left {counted(evaluator.left_out, 'run')} out of its averages"] * bool(evaluator.left_out)
     lost = f" It {' and '.join(why)}, as runs diverged or parameters were out of their range." if why else ""
     best, is_run = min(evaluator.history, key=lambda record: record.loss), hasattr(problem, "simulation")
-    held = evaluator.promises.held(lower, upper, layout)
-    misled, stays, doubts = evaluator.promises.doubt(gradient, algorithm, outcome.converged, is_run, held)
+    misled, stays, doubts = evaluator.promises.doubt(search, gradient, algorithm, outcome.converged, is_run)
     ended = outcome.message.replace(" converged ", " ended ") if misled else outcome.message
     return Result(
         parameters={name: a.copy() if isinstance(a, np.ndarray) else a for name, a in best.parameters.items()},
@@ -321,7 +305,3 @@ def optimise(
 
 optimize = optimise
 """American spelling of `optimise`."""
-
-
-def _description(setting: object) -> str:
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(setting))

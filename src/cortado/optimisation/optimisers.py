@@ -10,29 +10,66 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import is_whole, require_at_most
+from cortado.arrays import as_number, is_whole, require_at_most
 from cortado.calls import face, keep_own, quoted
 from cortado.device.threads import require
 from cortado.errors import InputError, shown
-from cortado.optimisation.search import (
-    Iterate,
-    Optimiser,
-    Outcome,
-    ParameterLayout,
-    PerParameter,
-    Search,
-    Vector,
-    require_fraction,
-    require_names,
-    require_positive,
-)
+from cortado.optimisation.search import Optimiser, Outcome, ParameterLayout, Search, Vector
 
+PerParameter = float | Mapping[str, float]
+HALVINGS = 10
+"""Greatest number of halvings of one step before the search ends."""
 GROWTH = 3.0
 """Longest trial of the line search, relative to the best length in the previous update."""
 SMALL = 0.01
 """Greatest ratio of the last to the first gradient for which L-BFGS reports convergence."""
 
 __all__ = ["LBFGS", "Adam", "GradientDescent", "LineSearch", "Optimiser", "Outcome", "Search"]
+
+
+def require_positive(name: str, values: PerParameter) -> None:
+    for value in values.values() if isinstance(values, Mapping) else [values]:
+        number = as_number(value)
+        if number is None or number <= 0.0:
+            raise InputError(f"{name} must be a positive, finite number, not {shown(value)}.")
+
+
+def require_fraction(name: str, value: float) -> None:
+    number = as_number(value)
+    if number is None or not 0.0 <= number < 1.0:
+        raise InputError(f"{name} must be a number in [0, 1), not {shown(value)}.")
+
+
+def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
+    """Raise `InputError` if ``values`` has a name that is not a parameter."""
+    if isinstance(values, Mapping) and set(values) != set(layout.names):
+        said = f"{name} is given for {quoted(values)}, but the optimised parameters are {quoted(layout.names)}"
+        raise InputError(f"{said}; give it for each of these, or one number for all.")
+
+
+class Iterate:
+    """The current point of an optimiser."""
+
+    def __init__(self, search: Search):
+        self._search, self.x = search, search.start
+        self.loss, self.gradient = search.evaluate(search.start)
+
+    def move(self, target: Vector) -> float:
+        """Move to a vector (size,). If the run there fails, the step is halved until a run succeeds. Return the
+        fraction of the step that was taken, or raise the error of the shortest step."""
+        self._search.updated()
+        part, tried = 1.0, target
+        found = self._search.attempt(tried)
+        while found is None:
+            part /= 2.0
+            tried = self._search.project(self.x + part * (target - self.x))
+            found = self._search.attempt(tried) if part > 0.5**HALVINGS else self._search.evaluate(tried)
+        self.x, (self.loss, self.gradient) = tried, found
+        return part
+
+    def outcome(self, name: str) -> Outcome:
+        """Return the outcome of an optimiser that has no convergence test."""
+        return Outcome(self.x, False, f"{name} made all its {self._search.iterations} updates.")
 
 
 @dataclass(frozen=True)
@@ -134,11 +171,9 @@ class LBFGS:
 
     L-BFGS finds accurate optima of smooth losses in few evaluations, but stops early if the gradient is noisy. The
     coordinates are (x - start) / scale for parameters x, and the loss is divided by the greatest component of the first
-    gradient in these coordinates. The first trial step is therefore at most about `scale` long, for any unit of the
-    loss.
+    gradient in these coordinates. The first trial step is therefore at most about `scale` long.
 
-    If the run of a trial diverges, the next trial is about a quarter as long. A diverged trial does not enter the
-    approximate Hessian.
+    If the run of a trial diverges, the next trial is about a quarter as long, and the approximate Hessian ignores it.
 
     With more than about 10^4 components the last bits of sums depend on the number of BLAS threads. Resume a large
     search with the same number of threads. If the numbers of a resumed run differ, an error is raised.
@@ -184,18 +219,16 @@ class LBFGS:
         def physical(y: Vector) -> Vector:
             return search.project(search.start + scale * y)
 
-        def in_units(loss: float, gradient: Vector) -> tuple[float, Vector]:
-            return loss / unit, scale * gradient / unit
-
-        base = tried = _Trial(np.zeros_like(search.start), *in_units(loss_start, gradient_start))
+        base = tried = np.zeros_like(search.start), loss_start / unit, scale * gradient_start / unit
 
         def scaled(y: Vector) -> tuple[float, Vector]:
             nonlocal tried
             found = search.attempt(physical(y)) if y.any() else (loss_start, gradient_start)
-            if found is None:
-                return base.rising(y)
-            tried = _Trial(y.copy(), *in_units(*found))
-            return tried.loss, tried.gradient
+            if found is None:  # a parabola that rises from the last iterate, with its minimum at a quarter of the way
+                start, loss, gradient = base
+                return loss - float(gradient @ (y - start)), -3.0 * gradient
+            tried = y.copy(), found[0] / unit, scale * found[1] / unit
+            return tried[1], tried[2]
 
         def updated(_: Vector) -> None:
             nonlocal base
@@ -229,20 +262,6 @@ class LBFGS:
             ended = f"stopped after {found.nit} iterations, as {why}, but {share}: the loss is too rough for it, so"
             ended += " try LineSearch from here."
         return Outcome(physical(found.x), found.status == 0 and left < SMALL, f"L-BFGS {ended}")
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """A point in the coordinates of L-BFGS (size,), with its loss and gradient (size,)."""
-
-    y: Vector
-    loss: float
-    gradient: Vector
-
-    def rising(self, y: Vector) -> tuple[float, Vector]:
-        """Return a substitute loss and gradient at y, where the run diverged. They are values of a parabola with its
-        minimum at a quarter of the way to y."""
-        return self.loss - float(self.gradient @ (y - self.y)), -3.0 * self.gradient
 
 
 def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vector) -> float:
@@ -292,10 +311,8 @@ class LineSearch:
         require_fraction("momentum", self.momentum)
         require_fraction("shortest", self.shortest)
         if not is_whole(self.trials) or self.trials < 2 or self.shortest == 0.0:
-            raise InputError(
-                f"trials is {shown(self.trials)} and shortest {shown(self.shortest)}, but must be at least 2 and "
-                "greater than 0."
-            )
+            said = f"trials is {shown(self.trials)} and shortest {shown(self.shortest)}"
+            raise InputError(f"{said}, but must be at least 2 and greater than 0.")
         require_at_most("trials", self.trials, 1_000)
 
     def check(self, layout: ParameterLayout) -> None:
@@ -333,8 +350,7 @@ BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "l
 
 
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """Make an optimiser from a name and settings, or return a given optimiser. Raises `InputError` for any other
-    object."""
+    """Make an optimiser from a name and settings, or return an optimiser. Raises `InputError` for other objects."""
     if isinstance(optimiser, str):
         if optimiser not in BY_NAME:
             wanted = f"one of {quoted(BY_NAME)}, or an object"
@@ -347,15 +363,11 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
         made: Optimiser = BY_NAME[optimiser](**settings)
         return made
     if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
-        raise InputError(
-            f"The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1), or one of "
-            f"{quoted(BY_NAME)}, not {shown(optimiser)}."
-        )
+        said = "The optimiser must be an object such as cortado.optimisers.Adam(learning_rate=0.1)"
+        raise InputError(f"{said}, or one of {quoted(BY_NAME)}, not {shown(optimiser)}.")
     if settings:
-        raise InputError(
-            f"optimise was given {quoted(settings)}, but takes settings only with the name of an optimiser, as an "
-            "object has its own."
-        )
+        said = f"optimise was given {quoted(settings)}, but takes settings only with the name of an optimiser"
+        raise InputError(f"{said}, as an object has its own.")
     return optimiser
 
 

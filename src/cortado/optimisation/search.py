@@ -11,22 +11,17 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, Self, runtime_checkable
+from typing import Any, BinaryIO, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from cortado.arrays import as_number
-from cortado.calls import quoted
-from cortado.errors import ComputationError, InputError, shown
+from cortado.errors import ComputationError, InputError
 from cortado.files.disk import parsed_json, sentences, write_atomically, write_fully
 from cortado.runs.run_folder import REPLAY_LOG
 
 Vector = npt.NDArray[np.float64]
 FORMAT = "cortado replay log 1"
-PerParameter = float | Mapping[str, float]
-HALVINGS = 10
-"""Greatest number of halvings of one step before the search ends."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +30,6 @@ class ParameterLayout:
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
-
-    @classmethod
-    def of(cls, parameters: Mapping[str, Vector]) -> Self:
-        return cls(tuple(parameters), tuple(np.shape(value) for value in parameters.values()))
 
     @property
     def sizes(self) -> list[int]:
@@ -49,16 +40,14 @@ class ParameterLayout:
         return sum(self.sizes)
 
     def ravel(self, parameters: Mapping[str, Any]) -> Vector:
-        """Return parameters by name as one vector (size,)."""
         parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
         return np.concatenate(parts)
 
     def unravel(self, vector: Vector) -> dict[str, Vector]:
         """Return copies of the parameters in a vector (size,), by name. Numbers become arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
-        return {
-            name: part.reshape(shape).copy() for name, shape, part in zip(self.names, self.shapes, parts, strict=True)
-        }
+        each = zip(self.names, self.shapes, parts, strict=True)
+        return {name: part.reshape(shape).copy() for name, shape, part in each}
 
     def spread(self, values: float | Mapping[str, float]) -> Vector:
         """Expand a number, or one number for each parameter, to a vector (size,)."""
@@ -87,12 +76,6 @@ class MemoryLog(list[LoggedEvaluation]):
         """Do nothing: no file is open."""
 
 
-def _has_records(path: Path) -> bool:
-    with sentences(path), open(path, "rb") as file:
-        file.readline()
-        return bool(file.read(1))
-
-
 class ReplayLog:
     """A replay log in one file of a folder. A killed process loses at most the evaluation that it is writing.
 
@@ -116,11 +99,13 @@ class ReplayLog:
         header = {"format": FORMAT, "names": list(layout.names), "shapes": shapes, **settings}
         if path.exists() and not path.is_file():
             raise InputError(f"'{path}' is no regular file; give another checkpoint folder.")
-        if not resume and path.exists() and _has_records(path):
-            raise InputError(
-                f"'{path}' already holds the evaluations of an optimisation; go on with it by resume=True, or "
-                "give another checkpoint folder."
-            )
+        if not resume and path.exists():
+            with sentences(path), open(path, "rb") as file:
+                file.readline()
+                has_records = bool(file.read(1))
+            if has_records:
+                said = f"'{path}' already holds the evaluations of an optimisation"
+                raise InputError(f"{said}; go on with it by resume=True, or give another checkpoint folder.")
         if not resume or not path.exists():
             with sentences(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -128,9 +113,7 @@ class ReplayLog:
         with sentences(path):
             self._file: BinaryIO = open(path, "r+b", buffering=0)  # noqa: SIM115 closed by close()
         try:
-            _check_header(self._file, header, path)
-            self._first_record = self._file.tell()
-            self._count = self._count_complete()
+            self._first_record, self._count = self._begun(header)
         except BaseException:
             self._file.close()
             raise
@@ -144,7 +127,6 @@ class ReplayLog:
         return LoggedEvaluation(values[1 : 1 + self._size], float(values[0]), values[1 + self._size :])
 
     def append(self, evaluation: LoggedEvaluation) -> None:
-        """Write an evaluation to the disk, or raise `ComputationError`."""
         values = np.concatenate([[evaluation.loss], evaluation.parameters, evaluation.gradient])
         content = self._count.to_bytes(8, "little") + values.astype("<f8").tobytes()
         try:
@@ -152,54 +134,48 @@ class ReplayLog:
             write_fully(self._file, content + zlib.crc32(content).to_bytes(4, "little"))
             os.fsync(self._file.fileno())
         except OSError as problem:
-            raise ComputationError(
-                f"An evaluation cannot be written to '{self._path}': {problem.strerror or problem}; free some space "
-                f"and resume. The {self._count} evaluations before it are kept."
-            ) from problem
+            said = f"An evaluation cannot be written to '{self._path}': {problem.strerror or problem}"
+            advice = f"free some space and resume. The {self._count} evaluations before it are kept"
+            raise ComputationError(f"{said}; {advice}.") from problem
         self._count += 1
 
     def close(self) -> None:
         self._file.close()
 
-    def _count_complete(self) -> int:
-        """Count the complete records. Raises `InputError` if a record before the last one is damaged."""
-        records, complete = (self._file.seek(0, os.SEEK_END) - self._first_record) // self._record_size, 0
-        self._file.seek(self._first_record)
+    def _begun(self, header: Mapping[str, Any]) -> tuple[int, int]:
+        """Return the place of the first record and the number of complete records. Raises `InputError` if the first
+        line differs from ``header``, or if a record before the last one is damaged."""
+        try:
+            found = parsed_json(self._file.readline(2**20))  # a damaged file may have no line end
+        except ValueError:
+            found = None
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise InputError(f"'{self._path}' is no replay log ('{FORMAT}'); give another checkpoint folder.")
+        for key, wanted in header.items():
+            if found.get(key) != wanted:
+                texts = (one if isinstance(one, str) else json.dumps(one) for one in (found.get(key), wanted))
+                former, given = (text.split("; ") for text in texts)
+                if len(former) == len(given):
+                    differing = [pair for pair in zip(former, given, strict=True) if pair[0] != pair[1]]
+                    former, given = ([pair[k] for pair in differing] for k in range(2))
+                begun = f"'{self._path}' cannot be resumed, because it was begun with {key} = {'; '.join(former)}"
+                now = f"is now given {key} = {'; '.join(given)}"
+                raise InputError(f"{begun} and {now}; give the former, or another checkpoint folder.")
+        first, complete = self._file.tell(), 0
+        records = (self._file.seek(0, os.SEEK_END) - first) // self._record_size
+        self._file.seek(first)
         while len(record := self._file.read(self._record_size)) == self._record_size:
             index, checksum = (int.from_bytes(part, "little") for part in (record[:8], record[-4:]))
             if index != complete or checksum != zlib.crc32(record[:-4]):
                 break
             complete += 1
         if complete < records - 1:
-            raise InputError(
-                f"Evaluation {complete} of the {records} in '{self._path}' is damaged; restore the file from a "
-                "copy, or begin again in another checkpoint folder."
-            )
-        return complete
+            said = f"Evaluation {complete} of the {records} in '{self._path}' is damaged"
+            raise InputError(f"{said}; restore the file from a copy, or begin again in another checkpoint folder.")
+        return first, complete
 
 
 Log = MemoryLog | ReplayLog
-
-
-def _check_header(file: BinaryIO, header: Mapping[str, Any], path: Path) -> None:
-    """Read the first line of a log. Raises `InputError` if it differs from ``header``."""
-    try:
-        found = parsed_json(file.readline(2**20))  # a damaged file may have no line end
-    except ValueError:
-        found = None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise InputError(f"'{path}' is no replay log ('{FORMAT}'); give another checkpoint folder.")
-    for key, wanted in header.items():
-        if found.get(key) != wanted:
-            texts = (one if isinstance(one, str) else json.dumps(one) for one in (found.get(key), wanted))
-            former, given = (text.split("; ") for text in texts)
-            if len(former) == len(given):
-                differing = [pair for pair in zip(former, given, strict=True) if pair[0] != pair[1]]
-                former, given = ([pair[k] for pair in differing] for k in range(2))
-            raise InputError(
-                f"'{path}' cannot be resumed, because it was begun with {key} = {'; '.join(former)} and "
-                f"is now given {key} = {'; '.join(given)}; give the former, or another checkpoint folder."
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,11 +185,9 @@ class Search:
     evaluate: Callable[[Vector], tuple[float, Vector]]
     """Function that maps a vector (size,) to the loss and the gradient (size,). It raises the error of a failed run."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
-    """Function that maps a vector (size,) to the loss and the gradient (size,). It returns None if the run diverges or
-    if a parameter is out of range."""
+    """Function that maps a vector (size,) to the loss and the gradient (size,), or to None for a failed run."""
     losses: Callable[[Sequence[Vector]], list[float]]
-    """Function that maps several vectors (size,) to their losses without gradients. The loss is infinite if the run
-    diverges or if a parameter is out of range."""
+    """Function that maps several vectors (size,) to their losses, infinite for failed runs, without gradients."""
     layout: ParameterLayout
     """Order and shapes of the parameters in the vector."""
     start: Vector
@@ -252,50 +226,3 @@ class Optimiser(Protocol):
 
     def minimise(self, search: Search) -> Outcome:
         """Lower the loss by at most `search.iterations` updates."""
-
-
-def require_positive(name: str, values: PerParameter) -> None:
-    for value in values.values() if isinstance(values, Mapping) else [values]:
-        number = as_number(value)
-        if number is None or number <= 0.0:
-            raise InputError(f"{name} must be a positive, finite number, not {shown(value)}.")
-
-
-def require_fraction(name: str, value: float) -> None:
-    number = as_number(value)
-    if number is None or not 0.0 <= number < 1.0:
-        raise InputError(f"{name} must be a number in [0, 1), not {shown(value)}.")
-
-
-def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
-    """Raise `InputError` if ``values`` has a name that is not a parameter."""
-    if isinstance(values, Mapping) and set(values) != set(layout.names):
-        raise InputError(
-            f"{name} is given for {quoted(values)}, but the optimised parameters are "
-            f"{quoted(layout.names)}; give it for each of these, or one number for all."
-        )
-
-
-class Iterate:
-    """The current point of an optimiser."""
-
-    def __init__(self, search: Search):
-        self._search, self.x = search, search.start
-        self.loss, self.gradient = search.evaluate(search.start)
-
-    def move(self, target: Vector) -> float:
-        """Move to a vector (size,). If the run there fails, the step is halved until a run succeeds. Return the
-        fraction of the step that was taken, or raise the error of the shortest step."""
-        self._search.updated()
-        part, tried = 1.0, target
-        found = self._search.attempt(tried)
-        while found is None:
-            part /= 2.0
-            tried = self._search.project(self.x + part * (target - self.x))
-            found = self._search.attempt(tried) if part > 0.5**HALVINGS else self._search.evaluate(tried)
-        self.x, (self.loss, self.gradient) = tried, found
-        return part
-
-    def outcome(self, name: str) -> Outcome:
-        """Return the outcome of an optimiser that has no convergence test."""
-        return Outcome(self.x, False, f"{name} made all its {self._search.iterations} updates.")

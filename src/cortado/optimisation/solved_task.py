@@ -75,7 +75,6 @@ class KnotValues:
 
 
 def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndarray]) -> dict[str, KnotValues]:
-    """Return the values at knots of all searched parameters over time, by name."""
     step = float(estimate.get("time_step", made.task.scene.solver.time_step))
     found = {}
     for name, bijector in made.search.coordinates.items():
@@ -165,15 +164,12 @@ def shaded_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
     picture, device = made.task.scene.picture or Picture(), made.problem.simulation.device
     steps = np.unique(np.linspace(0, made.problem.steps, max(picture.searched_frames, 2)).astype(int)).tolist()
 
-    def run(parameters: Mapping[str, Any]) -> Run:
-        return made.problem.states(dict(parameters), steps)
-
     def found(u: dict[str, np.ndarray]) -> Run:
-        return run(made.search.parameters(u))
+        return made.problem.states(made.search.parameters(u), steps)
 
     runs = {"first guess": found(made.start), "found": found(result.parameters)}
     if made.task.problem.picture is None:
-        runs["target"] = run(made.task.true_parameters)
+        runs["target"] = made.problem.states(made.task.true_parameters, steps)
     still, moving = (partial(_page, made, one, device=device) for one in (picture, picture.for_films))
     write_picture(folder / "found.png", still(list(runs), list(runs.values())).image(steps[-1]))
     compared: Figures = [(f"The end of the run: {', '.join(runs)}.", folder / "found.png")]
@@ -223,13 +219,13 @@ class MeasuredScene:
     problem: tables.ProblemTable
 
     def experiment(self, device: str, precision: str) -> Experiment:
-        """Make the experiment on a device. Raises `InputError` or `SceneError` if the data cannot be read or used."""
         simulation, folder = Simulation(self.scene, device, precision), Path(self.file).parent
         last = self.problem.steps * float(self.scene.solver.time_step)
-        found = {}
+        kinds: dict[str, Any] = {"video": _video, "sensor": _series, "tracks": _tracks}
+        found = dict[str, Observation]()
         for k, table in enumerate(self.problem.measured):
             try:
-                found[table.name] = observation(table, simulation, folder, last)
+                found[table.name] = kinds[table.kind](table, simulation, folder, last)
             except InputError as error:
                 raise InputError(f"{self.file}: problem.measured[{k}] ({table.name}): {error}") from None
         return Experiment(simulation, found, self.problem.steps)
@@ -271,14 +267,6 @@ def _read(data: dict[str, Any], file: str, model: type[Table]) -> tuple[Measured
     if not found.problem.measured:
         raise SceneError(file, "problem.measured", MISSING, "a list of tables, each written [[problem.measured]]")
     return MeasuredScene(file, scene.lasting(steps=found.problem.steps), found.problem), found
-
-
-def observation(table: tables.AnyMeasured, simulation: Simulation, folder: Path, last: float) -> Observation:
-    """Make the observation of a table of measured data. ``last`` is the end time of the run [s]. Raises
-    `InputError`."""
-    kinds: dict[str, Any] = {"video": _video, "sensor": _series, "tracks": _tracks}
-    made: Observation = kinds[table.kind](table, simulation, folder, last)
-    return made
 
 
 def _video(table: tables.VideoTable, simulation: Simulation, folder: Path, last: float) -> Observation:

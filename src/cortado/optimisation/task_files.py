@@ -25,12 +25,7 @@ from cortado.scene.tables import MISSING, Table, sentences
 from cortado.simulation import Simulation
 from cortado.solvers.build import known_in
 
-_ALGORITHMS = {
-    "adam": "Adam",
-    "gradient_descent": "gradient descent",
-    "lbfgs": "L-BFGS",
-    "line_search": "a line search",
-}
+_ALGORITHMS = {"adam": "Adam", "lbfgs": "L-BFGS", "line_search": "a line search"}
 DRAWN = {"heart": heart, "rosetta": rosetta}
 GIVEN = Words("given")
 
@@ -172,7 +167,6 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
 def _check_bounds(
     name: str, pair: np.ndarray, optimise: OptimiseTable, start: Mapping[str, Any], scene: Scene, known: Known
 ) -> None:
-    """Raise `SceneError` for bounds that are invalid or exclude the start."""
     field = f"optimise.bounds.{name}"
     if name not in start:
         raise SceneError(None, field, GIVEN, "left out, as optimise.start lacks it")
@@ -224,12 +218,9 @@ def task_in_words(task: Task) -> list[str]:
     length = f"{counted(problem.steps, 'step')} ({seconds:.4g} s)" if problem.steps else "no steps"
     question = f"Which {_listed(task.start)} makes the fluid {wanted}? A run has {length}."
     knots = f", by {settings.knots} knots in time" if settings.knots else ""
-    algorithm = _ALGORITHMS.get(settings.optimiser, settings.optimiser)
-    how = (
-        f"The search goes by {algorithm} with a learning rate of {settings.learning_rate:g}, "
-        f"for {counted(settings.iterations, 'iteration')} at most{knots}."
-    )
-    check = settings.check
+    algorithm = _ALGORITHMS.get(settings.optimiser, settings.optimiser.replace("_", " "))
+    most, check = f"for {counted(settings.iterations, 'iteration')} at most{knots}", settings.check
+    how = f"The search goes by {algorithm} with a learning rate of {settings.learning_rate:g}, {most}."
     words = {
         "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
         "parameter_error": f"parameters within {100 * check.parameter_error:g}% of the hidden ones",
@@ -266,7 +257,7 @@ class Setup:
 
     def image(self, end: Snapshot) -> np.ndarray:
         assert self.renderer is not None
-        return _image(self.renderer, end)
+        return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
     def true_parameter(self, name: str) -> np.ndarray | None:
         return self.task.true_parameters.get(name)
@@ -327,11 +318,7 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         raise InputError(f"problem.target: {error}") from None
     if renderer is None:
         return {step: end.positions for step, end in ends.items()}
-    return {step: _image(renderer, end) for step, end in ends.items()}
-
-
-def _image(renderer: Renderer, end: Snapshot) -> np.ndarray:
-    return renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
+    return {k: renderer.render(e.state.positions, e.state.mass_fractions, e.colours) for k, e in ends.items()}
 
 
 def _start(name: str, value: Any, simulation: Simulation) -> np.ndarray:

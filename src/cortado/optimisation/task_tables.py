@@ -1,23 +1,14 @@
 """The tables [problem], [optimise] and [fit] of a task, and the JSON schema of scene, task and data set files."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import (
-    BeforeValidator,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    ValidatorFunctionWrapHandler,
-    WithJsonSchema,
-    WrapValidator,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, WrapValidator, model_validator
 
 from cortado.arrays import as_number
 from cortado.errors import Words
@@ -70,7 +61,7 @@ def _offered(info: ValidationInfo) -> str:
     return f"one of {', '.join((info.context or {}).get('names', NAMES))}"
 
 
-def _known(name: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+def _known(name: Any, check: Callable[[Any], Any], info: ValidationInfo) -> Any:
     """Check that a scene has the parameter with this name."""
     if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
@@ -165,9 +156,9 @@ class TracksTable(MeasuredTable):
 AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(discriminator="kind")]
 
 
-def _growing(value: Any, check: ValidatorFunctionWrapHandler) -> tuple[float, ...]:
+def _growing(value: Any, check: Callable[[Any], Any]) -> tuple[float, ...]:
     """Return the factors of a continuation schedule. Raises a `field_error` unless they increase to 1."""
-    with suppress(ValidationError):
+    with suppress(ValueError):
         factors = check(value)
         if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
             return factors

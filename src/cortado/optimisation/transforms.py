@@ -35,8 +35,7 @@ class Bijector(Protocol):
         """Return the coordinates u whose parameter p(u) is nearest to ``parameter``."""
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
-        """Return the derivative of a loss with respect to u. ``bar`` is the derivative of the loss with respect to
-        p(u)."""
+        """Return the derivative of a loss with respect to u, given its derivative ``bar`` with respect to p(u)."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,7 @@ class Logarithm:
 
 @dataclass(frozen=True)
 class Softmax:
-    """The transform p_k = exp(u_k) / sum_l exp(u_l) of coordinates u (n, phases) to fractions p (n, phases) that sum to
-    1."""
+    """The transform p_k = exp(u_k) / sum_l exp(u_l) of coordinates u (n, phases) to fractions p (n, phases)."""
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
         return softmax(_shaped("coordinates", u, lambda shape: len(shape) == 2, "a row for each particle"), axis=1)
@@ -110,8 +108,7 @@ class TimeInterpolation:
 
 @fixed
 class Affine:
-    """The transform p = base + matrix u of coordinates u, for example for accelerations of a tank with a fixed end
-    position."""
+    """The transform p = base + matrix u, for example for accelerations of a tank with a fixed end position."""
 
     def __init__(self, base: Any, matrix: Any):
         """Store ``base``, in the shape and unit of the parameter, and ``matrix`` with ``base.shape + u.shape``."""
@@ -171,8 +168,7 @@ class Transformed(OtherParameters):
     """A problem as a function of coordinates of some parameters. The remaining parameters are unchanged."""
 
     def __init__(self, problem: Problem, coordinates: Mapping[str, Bijector]):
-        """Store a ``problem``, and a bijector for each parameter in ``coordinates``. Raises `InputError` for unknown
-        parameters."""
+        """Store a ``problem``, and a bijector for each parameter in ``coordinates``, or raise `InputError`."""
         require_methods("problem", problem, ("value", "forward_pass"), "a cortado.Problem")
         require_table("coordinates", coordinates, "{'viscosity': Logarithm()}")
         for name, bijector in coordinates.items():
@@ -197,15 +193,12 @@ class Transformed(OtherParameters):
         return {**u, **{name: self.coordinates[name].parameter(value) for name, value in known.items()}}
 
     def coordinate(self, parameters: Mapping[str, Any]) -> Arrays:
-        """Convert parameters to coordinates u by name."""
         require_table("parameters", parameters, "{'viscosity': value}")
         names = self.coordinates.keys() & parameters.keys()
         known = {name: as_numbers(f"parameter {name}", parameters[name]) for name in names}
         return {**parameters, **{name: self.coordinates[name].coordinate(value) for name, value in known.items()}}
 
-    def value_and_gradient(
-        self, u: Mapping[str, Any], gradient: GradientEstimator | None = None
-    ) -> tuple[float, Arrays]:
+    def value_and_gradient(self, u: Values, gradient: GradientEstimator | None = None) -> tuple[float, Arrays]:
         """Return the loss and its derivatives with respect to the coordinates."""
         found = self.estimate(u, gradient)
         return found.loss, found.gradient
@@ -213,8 +206,7 @@ class Transformed(OtherParameters):
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Estimate the loss and the gradient at coordinates u. The spread of an ensemble is in the units of the
-        coordinates."""
+        """Estimate the loss and the gradient at coordinates u. Ensembles have spreads in units of the coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":

@@ -1,5 +1,4 @@
-"""Standard errors of a least-squares estimate with residuals that are correlated within a frame and from frame to
-frame.
+"""Standard errors of a least-squares estimate with correlated residuals in a frame and from frame to frame.
 
 Near the estimate the residuals are r = e - J t. Here e (frames, m) is the noise, J (frames, m, parameters) the
 Jacobian, and t the error of the estimate. The m numbers of a frame are not independent, because neighbouring pixels,
@@ -71,8 +70,7 @@ class ScoreCovariance:
     frames: float
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Return Satterthwaite's degrees of freedom (1946) for a combination of parameters ``direction`` (p,).
-        ``inverse`` is the inverse Hessian."""
+        """Return Satterthwaite's degrees of freedom (1946) for a combination ``direction`` (p,) of parameters."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
@@ -104,8 +102,7 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """Return the number of independent frames, F (1 - c) / (1 + c), for F frames and the correlation c from frame to
-    frame."""
+    """Return the number F (1 - c) / (1 + c) of independent frames, for F frames with a correlation c of neighbours."""
     c = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
     return float(len(times) * (1.0 - c) / (1.0 + c))
 
@@ -132,8 +129,7 @@ def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: 
 
 
 def _moments(gram: np.ndarray, F: int) -> tuple[float, float]:
-    """Return unbiased estimates of (tr C)^2 and tr C^2 for a covariance matrix C, from the products ``gram`` of F
-    samples."""
+    """Return unbiased estimates of (tr C)^2 and tr C^2 for a covariance matrix C, from products of F samples."""
     trace, square = float(np.trace(gram)), float((gram**2).sum())
     if not trace > 0.0:
         return 1.0, 1.0
@@ -162,15 +158,6 @@ class FittedPart:
 
 
 @dataclass(frozen=True)
-class Widened:
-    parts: list[Part]
-    labels: list[str]
-
-
-Fitted = LeastSquares | Widened
-
-
-@dataclass(frozen=True)
 class Certainty:
     """Hessian, covariance and degrees of freedom of an estimate, from its residuals."""
 
@@ -184,9 +171,8 @@ class Certainty:
     parts: tuple[FittedPart, ...]
 
     @classmethod
-    def of(cls, problem: Fitted, at: Linearised, weights: Weights) -> "Certainty":
-        """Compute the certainty at a point. Raises `ComputationError` if a combination of parameters is
-        undetermined."""
+    def of(cls, problem: LeastSquares, at: Linearised, weights: Weights) -> "Certainty":
+        """Compute the certainty at a point. Raises `ComputationError` for undetermined combinations of parameters."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()
@@ -207,7 +193,7 @@ class Certainty:
         return cls(N, covariance, np.array(freedom), tuple(scores), tuple(parts))
 
 
-def noise_of(problem: Fitted, at: Linearised, weights: Weights) -> list[Weighting]:
+def noise_of(problem: LeastSquares, at: Linearised, weights: Weights) -> list[Weighting]:
     """Return weights from the residuals of a first fit. Correlated residuals have smaller weights."""
     N_inverse = inverse(problem, hessian(problem, at, weights))
     found = []
@@ -223,21 +209,14 @@ def noise_of(problem: Fitted, at: Linearised, weights: Weights) -> list[Weightin
     return found
 
 
-def counted_covariance(problem: Fitted, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return the covariance of the estimate (free, free), assuming that all measured numbers are independent."""
-    alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
-    return inverse(problem, hessian(problem, at, alone))
-
-
-def hessian(problem: Fitted, at: Linearised, weights: Weights) -> np.ndarray:
+def hessian(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
     """Return the Hessian (free, free), computed from the weighted Jacobians."""
     flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))
 
 
-def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
-    """Return the inverse of the Hessian N (free, free). Raises `ComputationError` if a combination of parameters is
-    undetermined."""
+def inverse(problem: LeastSquares, N: np.ndarray) -> np.ndarray:
+    """Return the inverse of the Hessian N (free, free), or raise `ComputationError` if it does not exist."""
     labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
@@ -247,14 +226,11 @@ def inverse(problem: Fitted, N: np.ndarray) -> np.ndarray:
     eigenvalues, axes = np.linalg.eigh(N / np.outer(size, size))
     if eigenvalues[0] < 1e-10:
         mixed = [label for label, a in zip(labels, axes[:, 0], strict=True) if abs(a) > 0.1]
-        raise ComputationError(
-            f"The measurements do not distinguish {' and '.join(mixed)}: leave one of them out of the fit, or measure "
-            "something else, too."
-        )
+        said = f"The measurements do not distinguish {' and '.join(mixed)}"
+        raise ComputationError(f"{said}: leave one of them out of the fit, or measure something else, too.")
     return np.asarray((axes / eigenvalues) @ axes.T / np.outer(size, size))
 
 
 def spread(r: np.ndarray) -> float:
     """Return the root mean square of the non-zero residuals."""
-    count = np.count_nonzero(r)
-    return float(np.sqrt((r**2).sum() / max(count, 1)))
+    return float(np.sqrt((r**2).sum() / max(np.count_nonzero(r), 1)))

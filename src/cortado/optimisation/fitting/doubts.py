@@ -6,20 +6,14 @@ direction. Its size is fitted together with the parameters, with an error bar.
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from cortado.errors import ComputationError, CortadoWarning, DivergedError, InputError
-from cortado.optimisation.fitting.certainty import (
-    Certainty,
-    ScoreCovariance,
-    Widened,
-    hessian,
-    inverse,
-    noise_of,
-    spread,
-)
+from cortado.optimisation.fitting.certainty import Certainty, hessian, inverse, noise_of, spread
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.least_squares import LeastSquares, Linearised, Weights, weighted
 from cortado.optimisation.fitting.observations import CLOCK
@@ -28,13 +22,11 @@ from cortado.scene.parameter_values import Arrays
 TOO_LARGE_IN_MOTION = 2.0
 """Ratio of the residuals of changing numbers to the residuals of constant numbers that causes a warning."""
 EXACT = 1e-4
-"""Greatest size of negligible residuals, relative to the largest measured number. Simulated measurements have
-negligible residuals."""
+"""Greatest negligible residuals, as those of simulated measurements, relative to the largest measured number."""
 
 
 def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> tuple[str, ...]:
-    """Return sentences of doubt about a fit, or nothing if the residuals look like noise and determine the
-    parameters."""
+    """Return sentences of doubt about a fit, unless the residuals look like noise and determine the parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
@@ -42,10 +34,9 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
             continue
         is_exact = False
         if noise is not None and size > 1.3 * noise:
-            found.append(
-                f"The residuals of {part.label} are {size / noise:.2g} times the noise that was given "
-                f"({size:.2g} against {noise:.2g} {part.observation.unit}): the model is wrong by that much."
-            )
+            against = f"{size:.2g} against {noise:.2g} {part.observation.unit}"
+            given = f"are {size / noise:.2g} times the noise that was given ({against})"
+            found.append(f"The residuals of {part.label} {given}: the model is wrong by that much.")
         still, moving = still_and_moving(part.observation.measured, r)
         if moving > TOO_LARGE_IN_MOTION * still:
             found.append(
@@ -61,16 +52,13 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
                 f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
             )
     if not is_exact:
-        found += _halves(problem, at, weights, certainty.scores)
-        found += [*_trends(problem, at, weights), *_clocks(problem, at, weights)]
+        found += _halves(problem, at, weights, certainty) + _trends_and_clocks(problem, at, weights)
     coordinates, bars = problem.coordinates, np.sqrt(np.diag(certainty.covariance))
     for which, ends in zip(("lower", "upper"), coordinates.bounds, strict=True):
         for label, u, end, value in zip(problem.labels, at.u, ends, coordinates.numbers(at.u), strict=True):
             if np.isfinite(end) and abs(u - end) <= 1e-6 * max(abs(end), 1.0):
-                found.append(
-                    f"{label} is {value:.4g}, its {which} bound: what was measured asks for a value beyond it, and its "
-                    "error bar tells nothing."
-                )
+                asked = "what was measured asks for a value beyond it, and its error bar tells nothing"
+                found.append(f"{label} is {value:.4g}, its {which} bound: {asked}.")
     for label, bar in zip(problem.labels, np.where(coordinates.by_logarithm, bars, 0.0), strict=True):
         if bar > 1.0:
             factor = np.exp(min(bar, 20.0))
@@ -90,13 +78,13 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
     return max(quiet, 0.002 * float(np.nanmax(np.abs(measured)))), moving  # half a step of 8 bits
 
 
-def _halves(problem: LeastSquares, at: Linearised, weights: Weights, scores: Sequence[ScoreCovariance]) -> list[str]:
+def _halves(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> list[str]:
     """Return sentences on parameters with different estimates from the first and the second half of the frames."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
         N, s, B = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
-        for r, J, score in zip(white, slopes, scores, strict=True):
+        for r, J, score in zip(white, slopes, certainty.scores, strict=True):
             chosen = np.array_split(np.arange(len(r)), 2)[half]
             N += np.einsum("fmp,fmq->pq", J[chosen], J[chosen], optimize=True)
             s += np.einsum("fmp,fm->p", J[chosen], r[chosen], optimize=True)
@@ -107,18 +95,14 @@ def _halves(problem: LeastSquares, at: Linearised, weights: Weights, scores: Seq
         steps.append(-inverse @ s)
         variances.append(np.diag(inverse @ B @ inverse))
     away = np.abs(steps[0] - steps[1]) / np.sqrt(variances[0] + variances[1] + 1e-300)
-    return [
-        f"The first half of the frames and the second one say different things of {label}: by {off:.2g} times the "
-        "error of the difference. The model is wrong, in a way that changes over time."
-        for label, off in zip(problem.coordinates.labels, away, strict=True)
-        if off > 3.0
-    ]
+    differ = "The first half of the frames and the second one say different things of"
+    wrong = "times the error of the difference. The model is wrong, in a way that changes over time."
+    each = zip(problem.labels, away, strict=True)
+    return [f"{differ} {label}: by {off:.2g} {wrong}" for label, off in each if off > 3.0]
 
 
-@dataclass(frozen=True)
-class Explained:
-    """The sizes of possible causes of residuals (causes,), and the explained fraction ``share`` of the sum of
-    squares."""
+class Explained(NamedTuple):
+    """The sizes of possible causes of residuals (causes,), and the explained fraction of the sum of squares."""
 
     sizes: np.ndarray
     share: float
@@ -136,16 +120,25 @@ def explained(
     from scipy.stats import f as fisher
 
     count = columns[0].shape[-1]
-    wide = Widened(problem.parts, [*problem.labels, *(f"cause {k}" for k in range(count))])
+    wide = copy(problem)
+    wide.labels = [*problem.labels, *(f"cause {k}" for k in range(count))]
     free = len(wide.labels)
     if sum(len(part.observation.times) for part in problem.parts) < free + 3:
         return None
     jacobians = [np.concatenate([J, c], axis=-1) for J, c in zip(at.jacobians, columns, strict=True)]
     before = Linearised(np.zeros(free), at.residuals, jacobians)
+
+    def step() -> Linearised:
+        N_inverse = inverse(wide, hessian(wide, before, weights))
+        white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
+        score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
+        u = -N_inverse @ score
+        each = zip(before.residuals, before.jacobians, strict=True)
+        return replace(before, u=u, residuals=[r + J @ u for r, J in each])
+
     try:
-        left = _step(wide, before, weights)
-        weights = noise_of(wide, left, weights)
-        left = _step(wide, before, weights)
+        weights = noise_of(wide, step(), weights)
+        left = step()
         found = Certainty.of(wide, left, weights)
     except ComputationError:
         return None
@@ -153,8 +146,8 @@ def explained(
     statistic = float(sizes @ np.linalg.pinv(V) @ sizes) / count
     least = fisher.isf(1e-3, count, found.degrees_of_freedom[-count:].min())
     gaps = [float(np.median(np.diff(part.observation.times))) for part in wide.parts]
-    each = [(one.correlation_time, gap) for one, gap in zip(weights, gaps, strict=True)]
-    fades_slowly = any(time and np.exp(-gap / time) > 0.6 for time, gap in each)
+    times = [one.correlation_time for one in weights]
+    fades_slowly = any(time and np.exp(-gap / time) > 0.6 for time, gap in zip(times, gaps, strict=True))
     if not is_doubted and (statistic <= least or fades_slowly):
         return None
     share = 1.0 - problem.sum_of_squares(left.residuals, weights) / problem.sum_of_squares(before.residuals, weights)
@@ -164,40 +157,54 @@ def explained(
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
     """Return sentences on the density of the fluid and the slip of the container. They need additional runs."""
     values, found = problem.coordinates.values(at.u), list[str]()
+
+    def by_density(experiment: Experiment, own: Arrays) -> Arrays:
+        direction = {"rest_density": experiment.simulation.parameters()["rest_density"]}
+        _, slopes = experiment.linearised(own, [direction])
+        problem.runs, problem.tangents = problem.runs + 1, problem.tangents + 1
+        return {name: slope[..., 0] for name, slope in slopes.items()}
+
+    def by_slip(experiment: Experiment, own: Arrays) -> Arrays:
+        slip = getattr(experiment.simulation.scene.container, "slip", None)
+        if slip is None:
+            return {}
+        simulation = experiment.simulation.replaced(f"container.slip={'no' if slip == 'free' else 'free'}")
+        changed, now = experiment.simulated_by(simulation).predicted(own), experiment.predicted(own)
+        problem.runs += 2
+        return {name: np.nan_to_num(changed[name] - now[name]) for name in now}
+
+    def explains(change: Callable[[Experiment, Arrays], Arrays]) -> Explained | None:
+        columns = _nothing(problem, 1)
+        for k, experiment in enumerate(problem.experiments):
+            try:
+                changed = change(experiment, problem.values_of(k, values))
+            except (DivergedError, InputError):
+                continue
+            for part, column in zip(problem.parts, columns, strict=True):
+                if part.experiment == k and changed:
+                    column[..., 0] = np.where(np.isnan(part.observation.measured), 0.0, changed[part.name])
+        return explained(problem, at, weights, columns, True)
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CortadoWarning)
-        said = None
-        if "rest_density" not in values:
-            said = explained(problem, at, weights, _by_change(problem, values, _by_density), True)
+        said = explains(by_density) if "rest_density" not in values else None
         if said and abs(said.sizes[0]) < 1.0:
-            found.append(
-                f"A density {1.0 + said.sizes[0]:.3g} times as large would explain {said.share:.0%} of the squares of "
-                "the residuals: is rest_density right?"
-            )
-        said = explained(problem, at, weights, _by_change(problem, values, _by_slip), True)
+            would = f"would explain {said.share:.0%} of the squares of the residuals: is rest_density right?"
+            found.append(f"A density {1.0 + said.sizes[0]:.3g} times as large {would}")
+        said = explains(by_slip)
         if said and said.sizes[0] > 0.0:
-            found.append(
-                f"The other slip of the container would explain {said.share:.0%} of the squares of the residuals: is "
-                "container.slip right?"
-            )
+            would = f"would explain {said.share:.0%} of the squares of the residuals: is container.slip right?"
+            found.append(f"The other slip of the container {would}")
     return found
-
-
-def _step(wide: Widened, before: Linearised, weights: Weights) -> Linearised:
-    N_inverse = inverse(wide, hessian(wide, before, weights))
-    white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
-    score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
-    u = -N_inverse @ score
-    return replace(before, u=u, residuals=[r + J @ u for r, J in zip(before.residuals, before.jacobians, strict=True)])
 
 
 def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
     return [np.zeros((*part.observation.measured.shape, count)) for part in problem.parts]
 
 
-def _trends(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences on linear and quadratic trends, for observations with at most four numbers per frame."""
-    found = []
+def _trends_and_clocks(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
+    """Return sentences on trends of observations with at most four numbers per frame, and on late clocks."""
+    found, late = list[str](), list[str]()
     for k, part in enumerate(problem.parts):
         times, measured = part.observation.times, part.observation.measured
         x = 2.0 * (times - times[0]) / (times[-1] - times[0]) - 1.0
@@ -213,52 +220,13 @@ def _trends(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str
                     f"{part.observation.unit}, which is {said.share:.0%} of their squares and no noise: the model is "
                     "wrong in a way that grows or fades."
                 )
-    return found
-
-
-def _clocks(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    found = []
-    for k, part in enumerate(problem.parts):
-        if CLOCK in part.observation.start:
-            continue
-        columns, measured = _nothing(problem, 1), part.observation.measured
-        rates = np.gradient(np.nan_to_num(measured) + at.residuals[k], part.observation.times, axis=0)
-        columns[k][..., 0] = np.where(np.isnan(measured), 0.0, rates)
-        said, times = explained(problem, at, weights, columns), part.observation.times
-        if said and abs(said.sizes[0]) < times[-1] - times[0]:
-            found.append(
-                f"Frames of {part.label} that are {said.sizes[0]:.2g} s later would explain {said.share:.0%} of the "
-                f'squares of the residuals: is its clock right? calibrate = ["{CLOCK}"] searches it.'
-            )
-    return found
-
-
-def _by_change(
-    problem: LeastSquares, values: Arrays, change: Callable[[Experiment, Arrays], tuple[int, int, Arrays]]
-) -> list[np.ndarray]:
-    """Return the changes of all predictions when ``change`` modifies an experiment. They are 0 if the run fails."""
-    columns = _nothing(problem, 1)
-    for k, experiment in enumerate(problem.experiments):
-        try:
-            runs, tangents, changed = change(experiment, problem.values_of(k, values))
-        except (DivergedError, InputError):
-            continue
-        problem.runs, problem.tangents = problem.runs + runs, problem.tangents + tangents
-        for part, column in zip(problem.parts, columns, strict=True):
-            if part.experiment == k and changed:
-                column[..., 0] = np.where(np.isnan(part.observation.measured), 0.0, changed[part.name])
-    return columns
-
-
-def _by_density(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    _, slopes = experiment.linearised(values, [{"rest_density": experiment.simulation.parameters()["rest_density"]}])
-    return 1, 1, {name: slope[..., 0] for name, slope in slopes.items()}
-
-
-def _by_slip(experiment: Experiment, values: Arrays) -> tuple[int, int, Arrays]:
-    slip = getattr(experiment.simulation.scene.container, "slip", None)
-    if slip is None:
-        return 0, 0, {}
-    simulation = experiment.simulation.replaced(f"container.slip={'no' if slip == 'free' else 'free'}")
-    changed, now = experiment.simulated_by(simulation).predicted(values), experiment.predicted(values)
-    return 2, 0, {name: np.nan_to_num(changed[name] - now[name]) for name in now}
+        if CLOCK not in part.observation.start:
+            columns, rates = _nothing(problem, 1), np.gradient(np.nan_to_num(measured) + at.residuals[k], times, axis=0)
+            columns[k][..., 0] = np.where(np.isnan(measured), 0.0, rates)
+            said = explained(problem, at, weights, columns)
+            if said and abs(said.sizes[0]) < times[-1] - times[0]:
+                late.append(
+                    f"Frames of {part.label} that are {said.sizes[0]:.2g} s later would explain {said.share:.0%} of "
+                    f'the squares of the residuals: is its clock right? calibrate = ["{CLOCK}"] searches it.'
+                )
+    return found + late

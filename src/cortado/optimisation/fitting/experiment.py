@@ -84,8 +84,7 @@ class Experiment:
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """Return the bounds of each calibrated clock [s]. The bounds are half of the measurement's duration before and
-        after 0."""
+        """Return the bounds of each calibrated clock [s]: half of the measurement's duration before and after 0."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -98,8 +97,7 @@ class Experiment:
         return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
-        """Return this experiment with new measured numbers (frames, m) by observation name. The copy shares all
-        remaining arrays."""
+        """Return this experiment with new measured numbers (frames, m) by observation name. All else is shared."""
         found = object.__new__(Experiment)
         again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
@@ -107,16 +105,13 @@ class Experiment:
 
     def predicted(self, parameters: Values) -> Arrays:
         """Return the predicted numbers of each observation (frames, m), by name."""
-        frames, values = self._frames(parameters), self._shared(parameters)
-        wanted = self._wanted(frames)
+        (frames, wanted), values = self._frames(parameters), self._shared(parameters)
         return self._read(self._problem(values, wanted).states(values, wanted), frames, parameters)
 
     def linearised(self, parameters: Values, directions: Sequence[Values]) -> tuple[Arrays, Arrays]:
-        """Return predictions (frames, m) and their derivatives along directions (frames, m, directions), by forward
-        mode."""
+        """Return predictions (frames, m) and derivatives along directions (frames, m, directions), by forward mode."""
         values, moves = self._shared(parameters), [self._shared(direction) for direction in directions]
-        frames = self._frames(parameters)
-        wanted = self._wanted(frames)
+        frames, wanted = self._frames(parameters)
         problem = self._problem(values, wanted)
         dimension, steps = self.simulation.dimension, set(wanted)
         tangents = [dict[int, Arrays]() for _ in moves]
@@ -153,18 +148,16 @@ class Experiment:
                 found[name] = found[name] + frames[name].rates(read, self._time_step)[..., None] * late
         return self._read(ends, frames, parameters), found
 
-    def _frames(self, parameters: Values) -> dict[str, Frames]:
-        found = {}
+    def _frames(self, parameters: Values) -> tuple[dict[str, Frames], list[int]]:
+        """Return the frames of each observation, and the steps whose states they need."""
+        found, wanted = dict[str, Frames](), set[int]()
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
             late = float(parameters.get(f"{name}.{CLOCK}", begun) - begun) if CLOCK in one.start else 0.0
             times = np.maximum(one.times + late, 0.0)
             found[name] = Frames.of(times, self._time_step, int(np.ceil(times[-1] / self._time_step)))
-        return found
-
-    def _wanted(self, frames: Mapping[str, Frames]) -> list[int]:
-        clocks = (own.around for name, own in frames.items() if CLOCK in self.observations[name].start)
-        return sorted(set().union(*(own.needed for own in frames.values()), *clocks))
+            wanted |= found[name].needed | (found[name].around if CLOCK in one.start else set())
+        return found, sorted(wanted)
 
     def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
         """Return a problem that covers the ``wanted`` steps. Its viscosity scheme suits the given values."""
@@ -191,9 +184,8 @@ class Experiment:
             read = {step: one.value(ends[step], own) for step in frames[name].needed}
             found[name] = frames[name].between(read)
             if found[name].shape != one.measured.shape:
-                raise InputError(
-                    f"{name} measured {one.measured.shape} numbers, but the simulation has {found[name].shape}."
-                )
+                said = f"{name} measured {one.measured.shape} numbers"
+                raise InputError(f"{said}, but the simulation has {found[name].shape}.")
         return found
 
     def _shared(self, values: Values) -> dict[str, Any]:
@@ -201,8 +193,5 @@ class Experiment:
         return {name: value for name, value in values.items() if name not in own}
 
     def _own(self, observation: str, values: Values) -> Arrays:
-        return {
-            key: np.asarray(values[f"{observation}.{key}"], dtype=np.float64)
-            for key in self.observations[observation].start
-            if f"{observation}.{key}" in values
-        }
+        given = {key: values.get(f"{observation}.{key}") for key in self.observations[observation].start}
+        return {key: np.asarray(value, dtype=np.float64) for key, value in given.items() if value is not None}

@@ -71,10 +71,8 @@ def video_figures(fitted: Fit, folder: Path) -> Figures:
                     pictures.append(picture)
                     titles.append(f"{title}, {video.times[k]:.3g} s")
             path = images(pictures, titles, folder / f"measured_{number}.png")
-            words = (
-                f"Frames of {part.label}. On the right grey is where both agree, light where too much light was found."
-            )
-            found.append((words, path))
+            words = "On the right grey is where both agree, light where too much light was found."
+            found.append((f"Frames of {part.label}. {words}", path))
     return found
 
 

@@ -1,5 +1,4 @@
-"""The function `cortado.fit`, which fits parameters to measured experiments. It also computes error bars and doubts
-about the model."""
+"""The function `cortado.fit`, which fits parameters to measured experiments, with error bars and doubts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,7 @@ from cortado.arrays import as_numbers, as_one_number, require_function, require_
 from cortado.calls import counted, public
 from cortado.errors import ComputationError, DivergedError, InputError, shown
 from cortado.lazy import on_top
-from cortado.optimisation.fitting.certainty import Certainty, FittedPart, counted_covariance, noise_of, spread
+from cortado.optimisation.fitting.certainty import Certainty, FittedPart, hessian, inverse, noise_of, spread
 from cortado.optimisation.fitting.doubts import dear_causes, doubts_of
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.gauss_newton import TINY, least, misfit, other_starts, over_the_bars, search
@@ -25,14 +24,8 @@ NOISE_ALONE = (
     "The bars are of noise alone and leave out what the spacing and the time step have wrong: a fit with another "
     "discretisation.spacing shows how much that is."
 )
-OF_VIEWS = {
-    "translation": "m",
-    "rotation": "rad",
-    "field_of_view": "degrees",
-    "width": "m",
-    "extinction": "1/m",
-    "start": "s",
-}
+OF_VIEWS = {"translation": "m", "rotation": "rad", "field_of_view": "degrees", "width": "m", "extinction": "1/m"}
+OF_VIEWS["start"] = "s"
 FAR, SAME = 3.0, 1e-3
 """Least distance [standard errors] and least relative difference between two distinct local minima."""
 
@@ -94,8 +87,7 @@ class Fit:
     coordinate_covariance: np.ndarray = field(repr=False)
     """Covariance of the coordinates (free, free)."""
     naive_covariance: np.ndarray = field(repr=False)
-    """Covariance (free, free) under the assumption that all measured numbers are independent. It is far too small, and
-    serves for comparison."""
+    """Covariance (free, free), far too small, as if all measured numbers were independent. It serves for comparison."""
     degrees_of_freedom: np.ndarray = field(repr=False)
     """Degrees of freedom of Student's t-distribution (free,)."""
     parts: tuple[FittedPart, ...] = field(repr=False)
@@ -133,15 +125,13 @@ class Fit:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the fitted numbers (free, free) in the units of the parameters. It is valid for
-        small errors."""
+        """Return the covariance of the fitted numbers (free, free), in their units. It is valid for small errors."""
         slopes = self.coordinates.slopes(self.u)
         return self.coordinate_covariance * np.outer(slopes, slopes)
 
     @property
     def standard_errors(self) -> dict[str, Any]:
-        """Return the standard errors by name, in the shape and the unit of each parameter. They are 0 for components
-        that were not fitted."""
+        """Return the standard errors by name, in the shape and unit of each parameter, 0 for numbers not fitted."""
         return _plain(self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0))
 
     @property
@@ -178,8 +168,7 @@ class Fit:
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
-        V = self.coordinate_covariance
-        counted = np.linalg.inv(self.hessian)[k, k]
+        V, counted = self.coordinate_covariance, np.linalg.inv(self.hessian)[k, k]
         deviance, shifts = [], np.linspace(-reach, reach, points) * np.sqrt(V[k, k])
         lower, upper = self.coordinates.bounds
         for shift in shifts:
@@ -193,8 +182,7 @@ class Fit:
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
     def log_posterior(self, u: Any) -> float:
-        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,), for samplers.
-        Each call takes a forward run.
+        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,), by a run.
 
         The prior is flat in the coordinates within the bounds. Coordinates of positive numbers are logarithms. The
         result is -inf outside the bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to
@@ -209,10 +197,8 @@ class Fit:
         if point.shape != self.u.shape:
             raise InputError(f"u has shape {point.shape}, but must be {self.u.shape}, one for each fitted number.")
         if self.problem is None:
-            raise InputError(
-                "The fit was pickled without its experiments, which are needed to compute how likely other "
-                "parameters are."
-            )
+            said = "The fit was pickled without its experiments"
+            raise InputError(f"{said}, which are needed to compute how likely other parameters are.")
         lower, upper = self.coordinates.bounds
         root = np.linalg.cholesky(self.hessian)
         wanted = np.linalg.cholesky(np.linalg.inv(self.coordinate_covariance))
@@ -228,8 +214,7 @@ class Fit:
 
     def numbers(self, confidence: float = 0.95) -> list["FittedNumber"]:
         """Return the fitted numbers with their confidence intervals."""
-        ends = self.intervals(confidence)
-        free = self.coordinates.free
+        ends, free = self.intervals(confidence), self.coordinates.free
         lower, upper = (np.concatenate([np.ravel(pair[k]) for pair in ends.values()])[free] for k in range(2))
         values, errors = self.coordinates.numbers(self.u), np.sqrt(np.diag(self.covariance))
         each = zip(self.labels, self.coordinates.at_start[free], values, errors, lower, upper, strict=True)
@@ -237,10 +222,8 @@ class Fit:
 
     def lines(self, confidence: float = 0.95) -> list[str]:
         """Return a line of text for each fitted number, with its value, standard error and confidence interval."""
-        return [
-            f"{one.words} ({100 * confidence:g} % between {one.lower:.4g} and {one.upper:.4g})"
-            for one in self.numbers(confidence)
-        ]
+        each, percent = self.numbers(confidence), f"{100 * confidence:g} %"
+        return [f"{one.words} ({percent} between {one.lower:.4g} and {one.upper:.4g})" for one in each]
 
     @property
     def in_doubt(self) -> bool:
@@ -273,8 +256,7 @@ def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error. The error has two digits if its first digit is 1 to 3, or else
-    one digit."""
+    """Format a value and its standard error. The error has two digits if the first one is 1 to 3, or else one."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -379,11 +361,12 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
     at, converged = least(problem, at, weights, iterations)
     at, settled = over_the_bars(problem, at, weights)
     found = Certainty.of(problem, at, weights)
+    alone = [Weighting(spread(r) or weight.scale) for r, weight in zip(at.residuals, weights, strict=True)]
     return Fit(
         coordinates=problem.coordinates,
         u=at.u,
         coordinate_covariance=found.covariance,
-        naive_covariance=counted_covariance(problem, at, weights),
+        naive_covariance=inverse(problem, hessian(problem, at, alone)),
         degrees_of_freedom=found.degrees_of_freedom,
         parts=found.parts,
         doubts=doubts_of(problem, at, weights, found),
@@ -418,7 +401,6 @@ def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
         return []
     k = int(np.argmax(np.abs(other.end - found.u) / np.maximum(bars, TINY)))
     label, value = found.labels[k], found.coordinates.numbers(other.end)[k]
-    return [
-        f"Another search ended where {label} is {value:.3g}, with residuals {np.exp(other.misfit - least):.3g} times "
-        "as large: what was measured hardly tells which of both is right."
-    ]
+    times = f"with residuals {np.exp(other.misfit - least):.3g} times as large"
+    said = f"Another search ended where {label} is {value:.3g}, {times}"
+    return [f"{said}: what was measured hardly tells which of both is right."]

@@ -58,8 +58,7 @@ def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) 
 def search(
     problem: LeastSquares, at: Linearised, weights: Weights, trials: int, enough: float, fixed: Sequence[int] = ()
 ) -> Searched:
-    """Reduce the sum of squares until the predicted relative reduction of the next step is at most ``enough``. The
-    coordinates with indices in ``fixed`` do not change.
+    """Reduce the sum of squares by steps of more than ``enough``, without a change of the coordinates ``fixed``.
 
     A trial point takes a forward run, and the Jacobian is estimated from all trial points. Steps are damped (Levenberg
     1944, Marquardt 1963) after a point without a reduction or with a diverged run.
@@ -99,8 +98,7 @@ def search(
 def next_point(
     problem: LeastSquares, at: Linearised, weights: Weights, damping: float = 0.0, fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, float]:
-    """Minimise the linear model's sum of squares within the bounds. Return the point (free,) and the predicted
-    decrease."""
+    """Minimise the linear model's sum of squares within the bounds. Return the point (free,) and the decrease."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
@@ -141,8 +139,7 @@ def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tu
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return independent moves by `REACH` standard errors as columns (free, free). Their length is at most a search
-    step."""
+    """Return independent moves by `REACH` standard errors as columns (free, free), at most as long as a search step."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.by_logarithm
@@ -170,8 +167,7 @@ def _differences(
 ) -> tuple[Linearised, list[Linearised]]:
     """Return the point with a Jacobian of differences along the axes, and the points that were run.
 
-    The smallest of the two one-sided differences and the central difference is used, because the point may lie on a
-    kink or in a very narrow minimum.
+    The smallest of both one-sided differences and the central one is used: the point may lie on a kink.
     """
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
@@ -191,8 +187,7 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Return the point moved by ``shift`` within the bounds, with the current Jacobian. The list is empty if the run
-    diverges."""
+    """Return the point moved by ``shift`` within the bounds, with its Jacobian, or nothing if its run diverges."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -201,8 +196,7 @@ def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Lin
 
 
 def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
-    """Return the mean logarithm of the residuals' size. For Gaussian noise it is least at the maximum of the
-    likelihood."""
+    """Return the mean logarithm of the residuals' size. Gaussian noise is most likely where it is least."""
     counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
     return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
 

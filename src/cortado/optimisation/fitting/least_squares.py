@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers, require_table
 from cortado.errors import DivergedError, InputError
 from cortado.optimisation.fitting.experiment import Experiment
 from cortado.optimisation.fitting.observations import Observation
+from cortado.optimisation.optimise import Bounds, checked_bounds, checked_start
 from cortado.scene.parameter_values import Arrays
 
 MOST_NUMBERS = 100
@@ -40,36 +40,25 @@ class Coordinates:
 
     @classmethod
     def of(
-        cls,
-        start: Mapping[str, Any],
-        positive: Iterable[str],
-        bounds: Mapping[str, tuple[Any, Any]] | None,
-        unseen: Mapping[str, np.ndarray] | None = None,
+        cls, start: Mapping[str, Any], positive: Iterable[str], bounds: Bounds | None, unseen: Arrays | None = None
     ) -> "Coordinates":
         """Make coordinates for initial values. ``positive`` parameters are fitted by their logarithm if all of their
         numbers are above 0. ``unseen`` numbers are not fitted. Raises `InputError` for unsuitable arguments."""
-        require_table("start", start, "{'viscosity': 0.5}")
-        values = {name: as_numbers(f"start of {name}", value) for name, value in start.items()}
-        given = {} if bounds is None else bounds
-        require_table("bounds", given, "{'viscosity': (0.1, 10.0)}")
-        for name in given:
-            if name not in values:
-                raise InputError(f"bounds has {name}, but must be made of parameters that start has.")
+        values = checked_start(start)
         by_logarithm = {name for name in positive if name in values and (values[name] > 0.0).all()}
-        ends = {name: _ends(name, values[name], given.get(name, (None, None))) for name in values}
+        ends = checked_bounds({} if bounds is None else bounds, values)
         for name, mask in ({} if unseen is None else unseen).items():
-            lower, upper = ends[name]
-            ends[name] = np.where(mask, values[name], lower), np.where(mask, values[name], upper)
+            for each in ends:
+                each[name] = np.where(mask, values[name], each[name])
 
         def flat(rows: Iterable[np.ndarray]) -> np.ndarray:
             return np.concatenate([np.ravel(row) for row in rows])
 
-        lower, upper = (flat(ends[name][k] for name in values) for k in range(2))
+        lower, upper = (flat(each.values()) for each in ends)
         logarithmic = flat(np.full(np.shape(v), name in by_logarithm) for name, v in values.items())
         lower = np.where(logarithmic, np.maximum(lower, 0.0), lower)
-        found = cls(
-            tuple(values), tuple(v.shape for v in values.values()), flat(values.values()), logarithmic, lower, upper
-        )
+        shapes = tuple(value.shape for value in values.values())
+        found = cls(tuple(values), shapes, flat(values.values()), logarithmic, lower, upper)
         if not 0 < found.free.sum() <= MOST_NUMBERS:
             raise InputError(f"start has {found.free.sum()} free numbers, but must have 1 to {MOST_NUMBERS}.")
         return found
@@ -87,12 +76,10 @@ class Coordinates:
     @property
     def labels(self) -> list[str]:
         """Return the names of the fitted numbers. Numbers of larger parameters have an index, as in "gravity[1]"."""
-        every = [
-            name if not shape else f"{name}[{', '.join(map(str, index))}]"
-            for name, shape in zip(self.names, self.shapes, strict=True)
-            for index in np.ndindex(*shape)
-        ]
-        return [label for label, is_free in zip(every, self.free, strict=True) if is_free]
+        found = list[str]()
+        for name, shape in zip(self.names, self.shapes, strict=True):
+            found += [f"{name}[{', '.join(map(str, k))}]" if shape else name for k in np.ndindex(*shape)]
+        return [label for label, is_free in zip(found, self.free, strict=True) if is_free]
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -119,9 +106,7 @@ class Coordinates:
         return np.where(self.by_logarithm, self.numbers(u), 1.0)
 
     def values(self, u: np.ndarray) -> Arrays:
-        whole = self.at_start.copy()
-        whole[self.free] = self.numbers(u)
-        return self.named(whole)
+        return self.spread(self.numbers(u), self.at_start)
 
     def named(self, whole: np.ndarray) -> Arrays:
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes)])
@@ -136,31 +121,15 @@ class Coordinates:
             found.append({name: value for name, value in self.named(whole).items() if value.any()})
         return found
 
-    def spread(self, free: np.ndarray, otherwise: float) -> Arrays:
+    def spread(self, free: np.ndarray, otherwise: float | np.ndarray) -> Arrays:
         """Return fitted numbers (free,) as arrays by name. Numbers that are not fitted are set to ``otherwise``."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
 
 
-def _ends(name: str, value: np.ndarray, pair: Any) -> tuple[np.ndarray, np.ndarray]:
-    if len(pair) != 2:
-        raise InputError(f"bounds of {name} must be a pair, the lower and the upper one.")
-    try:
-        lower, upper = (
-            np.broadcast_to(way * np.inf if end is None else as_numbers(f"a bound of {name}", end), value.shape)
-            for way, end in zip((-1.0, 1.0), pair, strict=True)
-        )
-    except ValueError:
-        raise InputError(f"bounds of {name} must be numbers, or have its shape, {value.shape}.") from None
-    if not ((lower <= value) & (value <= upper)).all():
-        raise InputError(f"start of {name} is {value.tolist()}, but must be within its bounds.")
-    return lower, upper
-
-
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Remove the correlation of values (frames, ...) between successive frames. The standard deviation does
-    not change."""
+    """Remove the correlation of values (frames, ...) between successive frames. Standard deviations do not change."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -169,8 +138,7 @@ def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> 
 
 @dataclass(frozen=True)
 class Part:
-    """An observation of an experiment. ``label`` has its name, and the number of the experiment if there are
-    several."""
+    """An observation of an experiment. ``label`` has its name, and the experiment's number if there are several."""
 
     experiment: int
     name: str
@@ -180,8 +148,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Weighting:
-    """The weighting of an observation's residuals: a scale in the unit of the observation, and a correlation
-    time [s]."""
+    """The weighting of residuals: a scale in the unit of the observation, and a correlation time [s]."""
 
     scale: float
     correlation_time: float = 0.0
@@ -218,6 +185,7 @@ class LeastSquares:
         self.experiments, self.coordinates = tuple(experiments), coordinates
         self._on_trial = on_trial
         several = len(self.experiments) > 1
+        self.labels = coordinates.labels
         self.parts = [
             Part(k, name, f"{name} of experiment {k + 1}" if several else name, one)
             for k, experiment in enumerate(self.experiments)
@@ -226,26 +194,20 @@ class LeastSquares:
         self.runs = self.tangents = self.refused = 0
         """Number of forward runs, followed by the numbers of forward-mode runs and of diverged runs."""
 
-    @property
-    def labels(self) -> list[str]:
-        return self.coordinates.labels
-
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
         """Return the residuals of each observation at coordinates u. Raises `DivergedError` if a run diverges."""
         found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
-        return [self._residual(part, found[part.experiment][part.name]) for part in self.parts]
-
-    def linearised(self, u: np.ndarray) -> Linearised:
-        return self._along(u, range(len(u)))
+        each = [(found[part.experiment][part.name], part.observation.measured) for part in self.parts]
+        return [np.nan_to_num(predicted - measured, nan=0.0) for predicted, measured in each]
 
     def estimated(self, u: np.ndarray) -> Linearised:
         """Return residuals and estimated Jacobians at a point. Derivatives with respect to positive numbers are
         differences, because forward runs are cheaper than forward-mode runs. Raises `DivergedError` if a run diverges.
         """
         positive = self.coordinates.by_logarithm
-        at = self._along(u, np.flatnonzero(~positive))
+        at = self.linearised(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
         for k in np.flatnonzero(positive):
             change = DIFFERENCE if u[k] + DIFFERENCE <= upper[k] else -DIFFERENCE
@@ -257,9 +219,10 @@ class LeastSquares:
                 J[..., k] = (after - before) / change
         return at
 
-    def _along(self, u: np.ndarray, columns: Iterable[int]) -> Linearised:
+    def linearised(self, u: np.ndarray, columns: Iterable[int] | None = None) -> Linearised:
+        """Return residuals and Jacobians at a point. The derivatives of coordinates outside ``columns`` are 0."""
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
-        directions = {number: every[number] for number in columns}
+        directions = {number: every[number] for number in (range(len(u)) if columns is None else columns)}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
         for k in range(len(self.experiments)):
             own = {number: self.values_of(k, direction) for number, direction in directions.items()}
@@ -267,10 +230,11 @@ class LeastSquares:
             predicted, slopes = self._run(k, values, [own[number] for number in run])
             for part in self.parts:
                 if part.experiment == k:
-                    jacobian = np.zeros((*part.observation.measured.shape, len(u)))
+                    measured = part.observation.measured
+                    jacobian = np.zeros((*measured.shape, len(u)))
                     jacobian[..., run] = slopes.get(part.name, 0.0)
-                    jacobian[np.isnan(part.observation.measured)] = 0.0
-                    residuals.append(self._residual(part, predicted[part.name]))
+                    jacobian[np.isnan(measured)] = 0.0
+                    residuals.append(np.nan_to_num(predicted[part.name] - measured, nan=0.0))
                     jacobians.append(jacobian)
         return Linearised(u.copy(), residuals, jacobians)
 
@@ -292,13 +256,9 @@ class LeastSquares:
             raise
 
     def values_of(self, experiment: int, values: Arrays) -> Arrays:
-        """Return the values of an experiment's parameters, without the parameters of observations in the remaining
-        experiments."""
+        """Return the values of an experiment's parameters, without those of observations in other experiments."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
-
-    def _residual(self, part: Part, predicted: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(predicted - part.observation.measured, nan=0.0)
 
 
 class TrialPoints:
@@ -315,12 +275,9 @@ class TrialPoints:
     def add(self, u: np.ndarray, residuals: list[np.ndarray]) -> int:
         self._points.append(u)
         self._residuals.append(residuals)
+        self.are_many = len(self._points) >= 5 * (len(u) + 1)
+        """True if the points need too much memory. The search should then start again at the lowest point."""
         return len(self._points) - 1
-
-    @property
-    def are_many(self) -> bool:
-        """Return True if the points need too much memory. The search should then start again at the lowest point."""
-        return len(self._points) >= 5 * (len(self._points[0]) + 1)
 
     def linearised(self, number: int) -> Linearised:
         x = np.array(self._points) @ self._metric.T  # the first Jacobian is orthonormal in these coordinates
@@ -333,40 +290,29 @@ class TrialPoints:
 
 
 def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
-    """Return the weights (d, points) for the slopes of the interpolation at point ``number``. They multiply the values
-    at all points ``x`` (points, d)."""
+    """Return the weights (d, points) of values at points ``x`` (points, d) in the slopes at point ``number``."""
+    from scipy.linalg import null_space
     from scipy.spatial.distance import cdist
+
+    def covariance(apart: np.ndarray) -> np.ndarray:  # Matérn, for distances in units of the width
+        smooth = (1.0 + apart + 0.4 * apart**2 + apart**3 / 15.0) * np.exp(-apart)
+        return smooth + 1e-12 * np.eye(len(apart))
 
     points, d = x.shape
     size = max(float(cdist(x, x).max()), TINY)
     x = (x - x[number]) / size
     linear, apart = np.column_stack([np.ones(points), x]), cdist(x, x)
-    width = _most_likely_width(apart, linear, products)
-    system = np.block([[_covariance(apart / width), linear], [linear.T, np.zeros((d + 1, d + 1))]])
+    contrasts = null_space(linear.T)
+    count, found = contrasts.shape[1], contrasts.T @ products @ contrasts
+
+    def deviance(width: float) -> float:
+        K = contrasts.T @ covariance(apart / width) @ contrasts
+        variance = float(np.trace(np.linalg.solve(K, found)))
+        return count * np.log(max(variance, TINY)) + float(np.linalg.slogdet(K)[1])
+
+    width = min(WIDTHS, key=deviance) if count > 1 else 1.0
+    system = np.block([[covariance(apart / width), linear], [linear.T, np.zeros((d + 1, d + 1))]])
     near = apart[:, [number]] / width
     of_noise = (3.0 + 3.0 * near + near**2) * np.exp(-near) / 15.0 * x / width**2
     slopes = np.vstack([of_noise, np.zeros(d), np.eye(d)])
     return np.asarray(np.linalg.lstsq(system, slopes)[0][:points].T / size)
-
-
-def _covariance(apart: np.ndarray) -> np.ndarray:
-    """Return the Matérn covariance (points, points) for distances in units of the width."""
-    smooth = (1.0 + apart + 0.4 * apart**2 + apart**3 / 15.0) * np.exp(-apart)
-    return smooth + 1e-12 * np.eye(len(apart))
-
-
-def _most_likely_width(apart: np.ndarray, linear: np.ndarray, products: np.ndarray) -> float:
-    from scipy.linalg import null_space
-
-    contrasts = null_space(linear.T)
-    count = contrasts.shape[1]
-    if count < 2:
-        return 1.0
-    found = contrasts.T @ products @ contrasts
-
-    def deviance(width: float) -> float:
-        K = contrasts.T @ _covariance(apart / width) @ contrasts
-        variance = float(np.trace(np.linalg.solve(K, found)))
-        return count * np.log(max(variance, TINY)) + float(np.linalg.slogdet(K)[1])
-
-    return min(WIDTHS, key=deviance)

@@ -91,9 +91,8 @@ class Frames:
         """Make frames for times [s]. Raises `InputError` for times after the end of the run."""
         places = times / time_step
         if places[-1] > steps + 1e-6:
-            raise InputError(
-                f"times go up to {times[-1]:g} s, but must end with the run, after {steps} steps of {time_step:g} s."
-            )
+            said = f"times go up to {times[-1]:g} s"
+            raise InputError(f"{said}, but must end with the run, after {steps} steps of {time_step:g} s.")
         whole = np.minimum(np.floor(places + 1e-6).astype(int), steps)
         shares = np.clip(places - whole, 0.0, 1.0)
         return cls(whole, np.where(shares < 1e-6, 0.0, shares))
@@ -107,8 +106,7 @@ class Frames:
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` has readings by step
-        number."""
+        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` has readings by step."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -121,8 +119,7 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock. If ``alone`` is true, further names in ``calibrate`` raise
-    `InputError`."""
+    """Return the parameter of a calibrated clock. If ``alone``, further names in ``calibrate`` raise `InputError`."""
     for name in calibrate if alone else ():
         if name != CLOCK:
             raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
@@ -135,10 +132,8 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
     values = read_only("measured", measured)
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
         found = f"has {len(moments)}" if moments.ndim == 1 else f"has shape {moments.shape}"
-        raise InputError(
-            f"times {found}, but must be a list of at least {LEAST_FRAMES} rising numbers, as error bars come from "
-            "the scatter from frame to frame."
-        )
+        said = f"times {found}, but must be a list of at least {LEAST_FRAMES} rising numbers"
+        raise InputError(f"{said}, as error bars come from the scatter from frame to frame.")
     if (falls := np.flatnonzero(np.diff(moments) <= 0.0)).size:
         before, after = moments[falls[0] : falls[0] + 2]
         raise InputError(f"times has {after:g} s after {before:g} s, but must rise from frame to frame.")
@@ -264,8 +259,7 @@ class SensorSeries:
             calibrate: ["start"] to fit the clock.
             clock: [s], added to the times.
         """
-        self.start = clock_of(calibrate, clock)
-        self.sensor = checked_sensor(sensor)
+        self.start, self.sensor = clock_of(calibrate, clock), checked_sensor(sensor)
         known = dict(sensor.columns(dimension))
         names = list(known) if columns is None else list(columns)
         for name in names:
@@ -286,8 +280,7 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives along directions. They are computed by adjoints, because sensors have no
-        forward mode."""
+        """Return the derivatives along directions. They are computed by adjoints: sensors have no forward mode."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
@@ -299,8 +292,7 @@ class SensorSeries:
 
 @fixed
 class Tracks:
-    """Positions of tracers over time, as an observation of a fit. A tracer moves with the particles around its initial
-    position:
+    """Positions of tracers over time, as an observation of a fit. A tracer moves with the particles around its start:
 
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 
@@ -344,10 +336,8 @@ class Tracks:
         self.times, self.measured, self.noise = checked(times, places.reshape(len(places), -1), noise, clock)
         x, domain = simulation.positions, simulation.lattice.domain
         support, period = simulation.scene.discretisation.support_radius, np.array(domain.lengths)
-        some, others = (
-            cKDTree(wrapped(points - np.array(domain.lower), period), boxsize=period if period.any() else None)
-            for points in (begun, x)
-        )
+        lower, size = np.array(domain.lower), period if period.any() else None
+        some, others = (cKDTree(wrapped(points - lower, period), boxsize=size) for points in (begun, x))
         near = some.sparse_distance_matrix(others, support, output_type="coo_matrix")
         w = csr_array((weights_of(near.data / support)[0], (near.row, near.col)), shape=(tracers, len(x)))
         sums = np.asarray(w.sum(axis=1)).ravel()
