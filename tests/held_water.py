@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 
 from cortado import Scene, Simulation
+from cortado.discretise.solid import rotation_matrix
 from cortado.scene.solid_shapes import BoxSolid, CupSolid, MeshSolid
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import rotation_matrix
 from scenes import box
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 0.001}

@@ -5,9 +5,9 @@ import pytest
 
 import cortado
 from cortado import DivergedError, InputError, Scene, SceneError, Simulation, Trajectory
+from cortado.discretise.solid import rotation_matrix
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.scene_warnings import standing_sentences
-from cortado.scene.tables import rotation_matrix
 from scenes import box, jet, pool
 
 WATER = {"name": "water", "rest_density": 1000.0, "viscosity": 1.0}

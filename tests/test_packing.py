@@ -14,9 +14,9 @@ from cortado.discretise.packing import PointsAround, Relaxation
 from cortado.discretise.room import Region
 from cortado.discretise.shapes import pairs_within
 from cortado.discretise.smoothing import CUBIC_SPLINE
+from cortado.discretise.solid import rotation_matrix
 from cortado.discretise.walls import RestLattice
 from cortado.scene.discrete_scene import DiscreteScene, discretise
-from cortado.scene.tables import rotation_matrix
 from scenes import bodies, box
 
 SPACING = 0.05

@@ -13,14 +13,13 @@ from cortado import DivergedError, Problem, SceneError, Simulation
 from cortado.device.precision import FLOAT32, FLOAT64
 from cortado.discretise.shapes import in_space, launch_on_cpu
 from cortado.discretise.sheet import Sheet, Thickened
-from cortado.discretise.solid import enclosed_moments
+from cortado.discretise.solid import enclosed_moments, rotation_matrix
 from cortado.discretise.tree_kernels import faces_on, find_crossing
 from cortado.losses import CentreOfMass
 from cortado.particles.sheets import Sheets
 from cortado.pictures.shown_solids import shown_solids
 from cortado.scene.discrete_scene import discretise
 from cortado.scene.motions import wall_numbers
-from cortado.scene.tables import rotation_matrix
 from cortado.solvers.projection.sides import NEAREST, Sides
 from scenes import box, simulated
 from test_moving_solids import WATER, plane, space

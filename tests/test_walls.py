@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from cortado import InputError, Scene, SceneError, Simulation
 from cortado.discretise.primitives import cut_box_faces
 from cortado.discretise.smoothing import KERNELS, SLACK
-from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box, wall_layers
+from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box
 from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.shape_tables import BoxContainer, Container
@@ -33,7 +33,7 @@ class FlatWall:
 
     def __init__(self, name: str, support: float, dimension: int):
         self.kernel, self.support, self.dimension = KERNELS[name], support * SPACING, dimension
-        self.layers = wall_layers(RestLattice(self.kernel, SPACING, self.support, dimension))
+        self.layers = RestLattice(self.kernel, SPACING, self.support, dimension).layers
         self.plane = SPACING * np.array(list(itertools.product(range(-4, 5), repeat=dimension - 1)), dtype=np.float64)
         whole = np.array(list(itertools.product(range(-4, 5), repeat=dimension)), dtype=np.float64)
         self.total = self.weight(SPACING * whole).sum()
@@ -87,7 +87,7 @@ def test_a_flat_wall_stops_a_particle_alone(name, dimension, support):
 
 @flat_walls
 def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
-    layers = wall_layers(RestLattice(KERNELS[name], SPACING, support * SPACING, dimension))
+    layers = RestLattice(KERNELS[name], SPACING, support * SPACING, dimension).layers
     wall = FlatWall(name, support, dimension)
     second = wall.missing(1) / wall.missing(0)
     assert len(layers.depths) == len(layers.weights) == (2 if second > 1e-6 else 1)
@@ -314,7 +314,7 @@ def test_a_box_below_a_plane_has_its_volume_and_faces(normal):
 @pytest.mark.parametrize(
     ("change", "container", "sentence"),
     [
-        ({"normal": [0.0, 0.0]}, BOX, "solid[0].normal is [0.0, 0.0], but must be a vector that is not 0"),
+        ({"normal": [0.0, 0.0]}, BOX, "solid[0].normal is [0.0, 0.0], but must be a vector that is not zero"),
         ({"normal": [0.0, 1.0, 0.0]}, BOX, "a list of 2 components"),
         ({"position": None}, BOX, "solid[0].position"),
         ({"side": "inside"}, BOX, "fluid is where the normal of a plane points"),

@@ -56,7 +56,13 @@ class TriangleTree:
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
         """Return the nearest points on the triangles (n, 3) [m] and the distances (n,) [m]. If no triangle is within
         ``reach`` [m], the nearest point is the given point, and the distance is ``reach``."""
-        order = np.arange(len(points)) if np.isfinite(reach) else _along_a_curve(points)
+        order = np.arange(len(points))
+        if np.isinf(reach) and len(points) > 1:  # along a space-filling curve (Morton 1966)
+            lower, sides = points.min(axis=0), np.ptp(points, axis=0)
+            cells = ((points - lower) * ((2**BITS - 1) / max(sides.max(), 1e-300))).astype(np.int64)
+            for shift, mask in SPREAD:
+                cells = (cells | cells << shift) & mask
+            order = np.argsort(cells @ np.array([1, 2, 4]), kind="stable")
         nearest, squares = np.empty((len(points), 3)), np.empty(len(points))
         self.ask("find_nearest", points[order], reach=reach, nearest=nearest, squares=squares)
         found, away = np.empty_like(nearest), np.empty_like(squares)
@@ -110,16 +116,9 @@ class TriangleTree:
         start_warp()
         from cortado.discretise import tree_kernels
 
-        launch_on_cpu(
-            getattr(tree_kernels, kernel),
-            len(points),
-            points=np.ascontiguousarray(points, dtype=np.float64),
-            boxes=shared(self.boxes, tree_kernels.box),
-            starts=self.starts,
-            corners=self.corners,
-            leaves=len(self.starts) - 1,
-            **arguments,
-        )
+        arguments |= {"points": np.ascontiguousarray(points, dtype=np.float64), "corners": self.corners}
+        arguments |= {"boxes": shared(self.boxes, tree_kernels.box), "starts": self.starts}
+        launch_on_cpu(getattr(tree_kernels, kernel), len(points), leaves=len(self.starts) - 1, **arguments)
 
 
 def _starts(count: int, level: int) -> Numbers:
@@ -129,17 +128,6 @@ def _starts(count: int, level: int) -> Numbers:
 def _near(first: Points, second: Points, reach: float) -> Which:
     apart = np.maximum(first[:, :3] - second[:, 3:], second[:, :3] - first[:, 3:])
     return np.asarray((apart <= reach).all(axis=1))
-
-
-def _along_a_curve(points: Points) -> Numbers:
-    """Return the order (n,) of points along a space-filling curve (Morton 1966)."""
-    if len(points) < 2:
-        return np.arange(len(points))
-    lower, sides = points.min(axis=0), np.ptp(points, axis=0)
-    cells = ((points - lower) * ((2**BITS - 1) / max(sides.max(), 1e-300))).astype(np.int64)
-    for shift, mask in SPREAD:
-        cells = (cells | cells << shift) & mask
-    return np.argsort(cells @ np.array([1, 2, 4]), kind="stable")
 
 
 LYING = 10.0
@@ -187,7 +175,11 @@ def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]
     frame = np.stack([first, np.cross(last, first), last])
     own, placed = (corners - corners[0]) @ frame.T, (others - corners[0]) @ frame.T
     lying = placed[(np.abs(placed[..., 2]) <= LYING * reach).all(axis=1)]
-    segments = np.concatenate([_sides(own[None]), _through(placed), _sides(lying)])
+    heights, following = placed[..., 2], np.roll(placed, -1, axis=1)
+    crossed = (heights > 0.0) != (following[..., 2] > 0.0)
+    along = (heights / np.where(crossed, heights - following[..., 2], 1.0))[..., None]
+    through = (placed + along * (following - placed))[crossed][:, :2].reshape(-1, 2, 2)
+    segments = np.concatenate([_sides(own[None]), through, _sides(lying)])
     lower, upper = own[:, :2].min(axis=0), own[:, :2].max(axis=0)
     meets = (segments.min(axis=1) <= upper).all(axis=1) & (segments.max(axis=1) >= lower).all(axis=1)
     flat = _pieces(segments[meets], lower[0], upper[0])
@@ -203,14 +195,6 @@ def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]
 def _sides(triangles: Points) -> Points:
     """Return the edges (3 n, 2, 2) of triangles (n, 3, 3) in the projection along the last axis."""
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)[..., :2].reshape(-1, 2, 2)
-
-
-def _through(triangles: Points) -> Points:
-    """Return the line segments (m, 2, 2) where triangles (n, 3, 3) intersect the plane at height 0."""
-    heights, following = triangles[..., 2], np.roll(triangles, -1, axis=1)
-    crossed = (heights > 0.0) != (following[..., 2] > 0.0)
-    along = (heights / np.where(crossed, heights - following[..., 2], 1.0))[..., None]
-    return (triangles + along * (following - triangles))[crossed][:, :2].reshape(-1, 2, 2)
 
 
 def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
@@ -237,9 +221,8 @@ def _pieces(segments: Points, lower: float, upper: float) -> Points:
         steeper = slope[i + 1 :] - slope[i]
         apart = (below[i] - slope[i] * start[i]) - (below[i + 1 :] - slope[i + 1 :] * start[i + 1 :])
         crossed = apart / np.where(steeper == 0.0, np.nan, steeper)
-        places.append(
-            crossed[(crossed > np.maximum(start[i], start[i + 1 :])) & (crossed < np.minimum(end[i], end[i + 1 :]))]
-        )
+        first, last = np.maximum(start[i], start[i + 1 :]), np.minimum(end[i], end[i + 1 :])
+        places.append(crossed[(crossed > first) & (crossed < last)])
     columns = np.unique(np.concatenate(places))
     columns = columns[(columns >= lower) & (columns <= upper)]
     found = [np.zeros((0, 3, 2))]
@@ -294,12 +277,12 @@ class Mesh(Solid):
     def _trees(self) -> Sequence[TriangleTree]:
         return self.known_trees or [TriangleTree.of(self.corners[part]) for part in self._numbers]
 
+    def extent(self) -> tuple[Points, Points]:
+        return self._ends
+
     @cached_property
     def _ends(self) -> tuple[Points, Points]:
         return self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
-
-    def extent(self) -> tuple[Points, Points]:
-        return self._ends
 
     def distance(self, points: Points) -> Points:
         """Return the distances of points from the surface. Where parts overlap, the depth is underestimated."""
@@ -313,9 +296,7 @@ class Mesh(Solid):
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:
-        if len(self._trees) == 1:
-            return self._trees[0].nearest(points)[0]
-        return self._looked_up(points, np.inf)[0]
+        return self._trees[0].nearest(points)[0] if len(self._trees) == 1 else self._looked_up(points, np.inf)[0]
 
     def outward(self, points: Points) -> Points:
         places, distances = self._looked_up(points, np.inf)
@@ -341,8 +322,8 @@ class Mesh(Solid):
         total = areas.sum()
         count = max(round(total / fine**2), 1)
         numbers = np.arange(count)
-        owner = np.searchsorted(np.cumsum(areas), (numbers + 0.5) * total / count)
-        owner = order[np.minimum(owner, len(order) - 1)]
+        place = np.searchsorted(np.cumsum(areas), (numbers + 0.5) * total / count)
+        owner = order[np.minimum(place, len(order) - 1)]
         along = np.mod(0.5 + numbers[:, None] * LOW_DISCREPANCY, 1.0)
         along = np.where(along.sum(axis=1, keepdims=True) > 1.0, 1.0 - along, along)
         a, b, c = np.moveaxis(self.corners[owner], 1, 0)
@@ -369,8 +350,7 @@ class Mesh(Solid):
 
     def normals(self) -> Points:
         """Return the outward unit normals of the triangles (k, 3). The normal of a triangle without area is 0."""
-        across = self._across
-        return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
+        return self._across / np.maximum(np.linalg.norm(self._across, axis=1, keepdims=True), 1e-300)
 
     def areas(self) -> Points:
         """Return the areas of the triangles (k,) [m2]."""

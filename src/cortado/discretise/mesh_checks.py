@@ -67,11 +67,8 @@ class Edges:
     def check(self, vertices: Points, what: str) -> None:
         """Raise `InputError` if an edge is not closed. ``what`` is the name of the mesh."""
         unbalanced, counts = ~self.close(), self.counts
-        for wrong, edge, sentence in (
-            (unbalanced & (counts > 2), "edge", MEETING),
-            (counts == 1, "open edge", OPEN),
-            (unbalanced, "edge", TURNED),
-        ):
+        meeting, opened = (unbalanced & (counts > 2), "edge", MEETING), (counts == 1, "open edge", OPEN)
+        for wrong, edge, sentence in (meeting, opened, (unbalanced, "edge", TURNED)):
             if wrong.any():
                 place = self.place(int(np.argmax(wrong)), vertices)
                 raise InputError(sentence.format(what=what, edges=counted(int(wrong.sum()), edge), place=place))
@@ -89,7 +86,9 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
     and triangles (k, 3)."""
     from scipy.spatial import cKDTree
 
-    vertices, names = _distinct(vertices)
+    order, names = np.lexsort(vertices.T), np.empty(len(vertices), dtype=np.int64)
+    new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
+    names[order], vertices = np.cumsum(new) - 1, vertices[order[new]]
     if tolerance > 0.0:
         groups = _connected(cKDTree(vertices).query_pairs(tolerance, output_type="ndarray"), len(vertices))
         vertices, names = vertices[np.unique(groups, return_index=True)[1]], groups[names]
@@ -99,14 +98,6 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
     once = np.sort(np.unique(turned, axis=0, return_index=True)[1])
     _, found, counts = np.unique(np.sort(turned[once], axis=1), axis=0, return_inverse=True, return_counts=True)
     return vertices, triangles[once[counts[found.ravel()] == 1]]
-
-
-def _distinct(vertices: Points) -> tuple[Points, Numbers]:
-    order = np.lexsort(vertices.T)
-    new = np.append(True, (np.diff(vertices[order], axis=0) != 0.0).any(axis=1))
-    names = np.empty(len(vertices), dtype=np.int64)
-    names[order] = np.cumsum(new) - 1
-    return vertices[order[new]], names
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
@@ -123,8 +114,7 @@ def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, w
     Raises `InputError` at an edge from which the surface continues in more than two directions. ``origin`` (3,) is the
     position of the mesh in the file.
     """
-    names = edges.names.ravel()
-    sides = np.argsort(names, kind="stable")
+    sides = np.argsort(edges.names.ravel(), kind="stable")
     first = np.append(0, np.cumsum(edges.counts))[:-1]
     two = edges.counts == 2
     links = [np.column_stack([sides[first[two]], sides[first[two] + 1]])]
@@ -269,10 +259,8 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
             f"finite, the first of them number {wrong[0]}, counted from 0: export the mesh once more."
         )
     length = np.ptp(used, axis=0).max()
-    far = (
-        f"{what} lies far from the origin: move it before it is exported, as the file rounds its coordinates to "
-        f"{rounding:g} there, beside a length of {length:g}."
-    )
+    far = f"{what} lies far from the origin: move it before it is exported, as the file rounds its coordinates to "
+    far += f"{rounding:g} there, beside a length of {length:g}."
     if rounding > COARSE * length:
         raise InputError(far)
     count, origin = len(triangles), whole_origin(used)
@@ -292,7 +280,7 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
     mesh = Mesh(vertices, triangles)
     tree = TriangleTree.of(mesh.corners)
     parts, notes = _solid_parts(mesh, tree, bodies(edges, vertices, triangles, origin, what), origin, what)
-    notes = (*notes, *((far,) if rounding > TOLD * length else ()))
+    notes += (far,) if rounding > TOLD * length else ()
     known = () if parts else (tree,)
     return FoundMesh(Mesh(vertices, triangles, parts, known), origin, notes, count - len(triangles))
 
@@ -310,8 +298,19 @@ def _solid_parts(
     some = some[mesh.areas()[some] > 0.0]
     beside = mesh.corners[some].mean(axis=1) + ASIDE * size * mesh.normals()[some]
     wrong = tree.windings(beside) < 0
+    if wrong.all():
+        raise InputError(
+            f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "
+            "over, as trimesh's mesh.invert() does."
+        )
     if wrong.any():
-        raise InputError(_inside_out(wrong, labels, labels[some], what, origin + mesh.corners[some[np.argmax(wrong)]]))
+        all_bodies, count = len(np.unique(labels)), len(np.unique(labels[some][wrong]))
+        which = f"{count} of the {all_bodies} bodies of {what}" if all_bodies > 1 else f"a part of {what}"
+        place = place_in_file((origin + mesh.corners[some[np.argmax(wrong)]]).mean(axis=0))
+        raise InputError(
+            f"The normals of {which} point inwards, for example at {place}, where there is nothing solid around them: "
+            "turn these triangles over, and mend what crosses itself."
+        )
     notes = []
     parts, crossing, filled = parts_of(mesh, tree, labels, crossings, some, beside)
     middles = origin + mesh.corners.mean(axis=1)
@@ -326,17 +325,3 @@ def _solid_parts(
             "difference: for a cavity turn its triangles over, as trimesh's mesh.invert() does."
         )
     return parts, tuple(notes)
-
-
-def _inside_out(wrong: np.ndarray, labels: Numbers, seen: Numbers, what: str, corners: Points) -> str:
-    if wrong.all():
-        return (
-            f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "
-            "over, as trimesh's mesh.invert() does."
-        )
-    all_bodies, count = len(np.unique(labels)), len(np.unique(seen[wrong]))
-    which = f"{count} of the {all_bodies} bodies of {what}" if all_bodies > 1 else f"a part of {what}"
-    return (
-        f"The normals of {which} point inwards, for example at {place_in_file(corners.mean(axis=0))}, where there is "
-        "nothing solid around them: turn these triangles over, and mend what crosses itself."
-    )

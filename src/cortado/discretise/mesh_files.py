@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cortado.calls import point_in_words
 from cortado.discretise.mesh import Mesh
 from cortado.discretise.mesh_checks import FoundMesh, found_mesh
 from cortado.discretise.shapes import Numbers, Points, bisected
@@ -49,7 +50,19 @@ def read_mesh(
     """
     found, what = mesh_in_file(path), repr(path)
     mesh = found.mesh.moved(scale, np.zeros(3))
-    _check_unit(mesh, what, scale, spacing, container)
+    length = float(np.ptp(mesh.extent(), axis=0).max())
+    room = None if container is None else float(np.ptp(container, axis=0).max())
+    if length > TOO_LARGE * (100.0 * spacing if room is None else room):
+        times = f"{length / spacing:,.0f} spacings" if room is None else f"{length / room:,.0f} times the container"
+        raise InputError(
+            f"{what} is {length:g} m long, {times}; it looks like millimetres: give it scale = {0.001 * scale:g}, and "
+            f"it will be {0.001 * length:g} m long."
+        )
+    if length < spacing:
+        raise InputError(
+            f"{what} is only {length:g} m long, less than a spacing, {spacing:g} m; it may have another unit of "
+            f"length, so give it a larger scale than {scale:g}, or make the spacing smaller."
+        )
     of_thickness = _thickness_notes(mesh, scale * found.origin, what, spacing, support) if support is not None else ()
     for note in (*found.notes, *of_thickness):
         warn(note)
@@ -76,11 +89,16 @@ def read_triangles(path: str) -> tuple[Points, Numbers, float]:
     return the rounding step of float32 coordinates, or 0. Raises `InputError` if there are no triangles."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
-    if not Path(path).stat().st_size:
+    if not (size := Path(path).stat().st_size):
         raise InputError(f"{path!r} is empty: export the mesh once more.")
-    rounding, is_single = 0.0, _is_single(path)
+    (scene, head), suffix = _scene(path), Path(path).suffix.lower()
+    is_single = suffix in (".gltf", ".glb")  # whether coordinates are float32
+    if suffix == ".ply":
+        is_single = not re.search(rb"property (double|float64) x", head)
+    elif suffix == ".stl":
+        is_single = len(head) >= 84 and size == 84 + 50 * int.from_bytes(head[80:84], "little")
+    rounding = 0.0
     vertices, triangles, count, others = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0, False
-    scene = _scene(path)
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         body = scene.geometry[name]
@@ -101,46 +119,19 @@ def read_triangles(path: str) -> tuple[Points, Numbers, float]:
     return np.concatenate(vertices), np.concatenate(triangles), rounding
 
 
-def _is_single(path: str) -> bool:
-    """Test whether the coordinates of a file are float32."""
-    suffix = Path(path).suffix.lower()
-    if suffix in (".stl", ".ply"):
-        with open(path, "rb") as file:
-            head = file.read(4096)
-        if suffix == ".ply":
-            return not re.search(rb"property (double|float64) x", head)
-        return len(head) >= 84 and Path(path).stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little")
-    return suffix in (".gltf", ".glb")
-
-
-def _scene(path: str) -> Any:
+def _scene(path: str) -> tuple[Any, bytes]:
+    """Read the scene of trimesh, and the first bytes of a file."""
     import trimesh
 
     try:
         with open(path, "rb") as file, warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             kind, beside = Path(path).suffix.lower()[1:], trimesh.resolvers.FilePathResolver(path)
-            return trimesh.load_scene(file, file_type=kind, resolver=beside, process=False)
+            head, _ = file.read(4096), file.seek(0)
+            return trimesh.load_scene(file, file_type=kind, resolver=beside, process=False), head
     except Exception as problem:  # of many types, where a file is damaged
         why = shown(Words(f"{type(problem).__name__}: {reason(problem)}"))
         raise InputError(f"{path!r} is no mesh that can be read ({why}); it may be damaged.") from None
-
-
-def _check_unit(mesh: Mesh, what: str, scale: float, spacing: float, container: tuple[Points, Points] | None) -> None:
-    length = float(np.ptp(mesh.extent(), axis=0).max())
-    room = None if container is None else float(np.ptp(container, axis=0).max())
-    beside = 100.0 * spacing if room is None else room
-    if length > TOO_LARGE * beside:
-        times = f"{length / spacing:,.0f} spacings" if room is None else f"{length / room:,.0f} times the container"
-        raise InputError(
-            f"{what} is {length:g} m long, {times}; it looks like millimetres: give it scale = {0.001 * scale:g}, and "
-            f"it will be {0.001 * length:g} m long."
-        )
-    if length < spacing:
-        raise InputError(
-            f"{what} is only {length:g} m long, less than a spacing, {spacing:g} m; it may have another unit of "
-            f"length, so give it a larger scale than {scale:g}, or make the spacing smaller."
-        )
 
 
 @dataclass(frozen=True)
@@ -156,8 +147,7 @@ class Thickness:
         return float(np.count_nonzero(which) / max(len(which), 1))
 
     def place(self, which: np.ndarray) -> str:
-        thinnest = self.points[which][np.argmin(self.lengths[which])]
-        return f"({', '.join(f'{value:g}' for value in thinnest)}) m"
+        return f"{point_in_words(self.points[which][np.argmin(self.lengths[which])])} m"
 
     @property
     def thinnest(self) -> float:

@@ -63,9 +63,9 @@ class PointsAround:
 
     def _looked(self, particles: Points, blind: Which, **given: Any) -> dict[str, Any]:
         count = len(particles)
-        given = {"are_own": False, "most": NO_LIMIT, "starts": np.zeros(count + 1, dtype=np.int32), **given}
-        found = {"others": np.zeros(1, dtype=np.int32), "counts": np.zeros(count, dtype=np.int32), **given}
-        found = {"sums": np.zeros(count), **found}
+        found = {"are_own": False, "most": NO_LIMIT, "starts": np.zeros(count + 1, dtype=np.int32), **given}
+        found |= {"counts": np.zeros(count, dtype=np.int32), "sums": np.zeros(count)}
+        found.setdefault("others", np.zeros(1, dtype=np.int32))
         if len(self.points):
             placed, grid = self._by_cell
             where = {"around": self.on_cpu, "placed": placed, "grid": grid, "reach": self.reach}
@@ -189,15 +189,10 @@ class Relaxation:
         at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
         self.sums, distances = np.full(count, at_its_place), np.empty(most)
         self._equations, close_starts = kernels.equations(), np.zeros(count + 1, dtype=np.int32)
-        arrays: dict[str, NDArray[Any]] = {
-            "starts": np.zeros(count + 1, dtype=np.int32),
-            "others": np.empty(most, dtype=np.int32),
-            "gradients": np.empty((most, 3)),
-            "own": np.empty((count, 3)),
-            "close_starts": close_starts,
-            "close_others": np.empty(most, dtype=np.int32),
-            "directions": np.empty((most, 3)),
-        }
+        arrays: dict[str, NDArray[Any]] = {"starts": np.zeros_like(close_starts), "close_starts": close_starts}
+        arrays |= {name: np.empty(most, dtype=np.int32) for name in ("others", "close_others")}
+        arrays |= {name: np.empty((most, 3)) for name in ("gradients", "directions")}
+        arrays["own"] = np.empty((count, 3))
         for name, array in arrays.items():
             setattr(self._equations, name, shared(array))
         self._launch(kernels.linearise, sums=self.sums, distances=distances, close=close, **self._given)
@@ -257,10 +252,16 @@ class Packing:
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Pack particles like `packed`, without the cache. Particles that remain too compressed are removed."""
+        """Pack particles like `packed`, without the cache. Particles that remain too compressed, and more so than their
+        neighbours, are removed."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
-            crowded = self._crowded(found, stays[kept])
+            errors = np.round(self.errors(found, np.ones(len(found), dtype=bool)), DIGITS)
+            over = np.flatnonzero((errors > COMPRESSED) & ~stays[kept])
+            points, reach = found[over], BESIDE * self.lattice.support
+            lengths = np.where(self.lengths > 2.0 * reach, self.lengths, 0.0)
+            one, other, _ = pairs_within(points, points, reach, lengths=lengths)
+            crowded = np.delete(over, np.unique(one[errors[over[one]] < errors[over[other]]]))
             if not len(crowded):
                 break
             kept, found = np.delete(kept, crowded), np.delete(found, crowded, axis=0)
@@ -268,42 +269,26 @@ class Packing:
         grain = self.lattice.spacing / GRAINS
         return np.asarray(particles[kept] + grain * np.rint((found - particles[kept]) / grain)), kept
 
-    def _crowded(self, particles: Points, stays: Which) -> Numbers:
-        """Return the indices (m,) of free, compressed particles whose free neighbours are less compressed."""
-        errors = np.round(self.errors(particles, np.ones(len(particles), dtype=bool)), DIGITS)
-        over = np.flatnonzero((errors > COMPRESSED) & ~stays)
-        points, reach = particles[over], BESIDE * self.lattice.support
-        lengths = np.where(self.lengths > 2.0 * reach, self.lengths, 0.0)
-        one, other, _ = pairs_within(points, points, reach, lengths=lengths)
-        less = one[errors[over[one]] < errors[over[other]]]
-        return np.delete(over, np.unique(less))
-
     def _at_rest(self, particles: Points, stays: Which) -> Points:
-        found = particles
+        found, support = particles.copy(), self.lattice.support
+        near, reach = support + self.lattice.spacing, support + LISTED * self.lattice.spacing
         for _ in range(MOST_LOOKS):
             wrong = self._wrong(found, stays)
             if not wrong.any():
                 break
-            found = self._settled_near(wrong, found, stays)
-        return found
-
-    def _settled_near(self, wrong: Which, particles: Points, stays: Which) -> Points:
-        """Move the particles near a particle marked in ``wrong`` (n,), and return all positions (n, d) [m]."""
-        support, near = self.lattice.support, self.lattice.support + self.lattice.spacing
-        movable = self._near(particles, wrong, near) & ~stays
-        region = self._near(particles, movable, support)
-        around, part = self._among(particles[~region]), particles[region]
-        part_stays, part_wrong = stays[region], wrong[region]
-        for _ in range(MOST_ROUNDS // ROUNDS):
-            free = around._near(part, part_wrong, near) & movable[region]
-            if not free.any():
-                break
-            seen = around._near(part, free, support)
-            others, reach = around._among(part[~seen]), support + LISTED * self.lattice.spacing
-            part[seen] = Relaxation(others._around(part[seen], reach), part_stays[seen], free[seen]).relaxed()
-            part_wrong[seen] = around._wrong(part, part_stays, seen)
-        found = particles.copy()
-        found[region] = part
+            movable = self._near(found, wrong, near) & ~stays
+            region = self._near(found, movable, support)
+            around, part = self._among(found[~region]), found[region]
+            part_stays, part_wrong = stays[region], wrong[region]
+            for _ in range(MOST_ROUNDS // ROUNDS):
+                free = around._near(part, part_wrong, near) & movable[region]
+                if not free.any():
+                    break
+                seen = around._near(part, free, support)
+                others = around._among(part[~seen])
+                part[seen] = Relaxation(others._around(part[seen], reach), part_stays[seen], free[seen]).relaxed()
+                part_wrong[seen] = around._wrong(part, part_stays, seen)
+            found[region] = part
         return found
 
     def _wrong(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Which:
@@ -313,9 +298,8 @@ class Packing:
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
         """Test (n,) which particles are at most ``reach`` [m] from a particle marked in ``some``."""
         others = particles[some]
-        weights, reach = np.ones(len(others)), reach * (1.0 + ROUND_OFF)
-        found = PointsAround(self.lattice, others, weights, (0, 0), self.lengths, reach)
-        return found.near(particles)
+        reach *= 1.0 + ROUND_OFF
+        return PointsAround(self.lattice, others, np.ones(len(others)), (0, 0), self.lengths, reach).near(particles)
 
     def _around(self, particles: Points, reach: float) -> PointsAround:
         count = len(particles)

@@ -4,13 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cortado.discretise.shapes import Block, Numbers, Points, Which, across, block_between
+from cortado.discretise.shapes import Block, Numbers, Points, across, block_between
 from cortado.discretise.shapes import corners as corners_of
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments, nearest_on_edges
 
 FACING = 0.9
 """Least cosine between the directions of two opposite sides of a polygon that form a sheet, with one direction
 reversed."""
+NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
+"""Nodes of three-point Gauss quadrature on the interval from 0 to 1."""
+WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,7 @@ class Round(Solid):
         above = arc(np.array([0.0, length]), self.radius, 0.0, np.pi, fine)
         profile = polygon_faces(np.concatenate([above, -above]))
         along = self.half / length if length > 0.0 else np.eye(len(self.half))[-1]
-        flat = len(self.half) == 2
-        upright = profile if flat else revolved_faces(profile, 2, fine)
+        upright = profile if len(self.half) == 2 else revolved_faces(profile, 2, fine)
         return upright.moved(_standing(along), np.zeros(len(along)))
 
     def moments(self) -> Moments:
@@ -120,7 +122,20 @@ class Revolved(Solid):
         return revolved_faces(self.profile.faces(fine), self.axis, fine)
 
     def moments(self) -> Moments:
-        return revolved_moments(outer_edges(self.profile.faces(np.inf)), self.axis)
+        edges = outer_edges(self.profile.faces(np.inf))
+        height, (start, end) = edges[..., 1].mean(), np.moveaxis(edges, 1, 0)
+        x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
+
+        def integral(p: int, q: int) -> float:
+            """Return the integral of x^p (y - height)^q over the profile, with radius x and height y, by Green's
+            theorem."""
+            return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
+
+        volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[self.axis]
+        middle = integral(1, 1) / integral(1, 0)
+        across, upright = np.pi * integral(3, 0), 2.0 * np.pi * integral(1, 2) - volume * middle**2
+        second = across * np.eye(3) + (upright - across) * np.outer(along, along)
+        return Moments(volume, (height + middle) * along, second)
 
     def _flat(self, points: Points) -> Points:
         """Return the distances from the axis and the heights of points (n, 2) [m]."""
@@ -175,8 +190,13 @@ class Polygon(Solid):
         return self.corners.min(axis=0), self.corners.max(axis=0)
 
     def distance(self, points: Points) -> Points:
-        away = np.linalg.norm(points - self.nearest(points), axis=1)
-        return np.where(self._holds(points), -away, away)
+        away, inside = np.linalg.norm(points - self.nearest(points), axis=1), np.zeros(len(points), dtype=bool)
+        for (x_0, y_0), (x_1, y_1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
+            if y_0 == y_1:
+                continue
+            spans = (y_0 > points[:, 1]) != (y_1 > points[:, 1])  # a ray along the first axis crosses the side
+            inside ^= spans & (points[:, 0] < x_0 + (points[:, 1] - y_0) * (x_1 - x_0) / (y_1 - y_0))
+        return np.where(inside, -away, away)
 
     def nearest(self, points: Points) -> Points:
         return nearest_on_edges(points, np.stack([self.corners, np.roll(self.corners, -1, axis=0)], axis=1))
@@ -209,16 +229,6 @@ class Polygon(Solid):
             least = np.minimum(*across)
             found = min(found, float(least[least > 0.0].min(initial=np.inf)))
         return found
-
-    def _holds(self, points: Points) -> Which:
-        """Test (n,) which points are inside, by counting the crossings of a ray along the first axis with the sides."""
-        inside = np.zeros(len(points), dtype=bool)
-        for (x_0, y_0), (x_1, y_1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
-            if y_0 == y_1:
-                continue
-            spans = (y_0 > points[:, 1]) != (y_1 > points[:, 1])
-            inside ^= spans & (points[:, 0] < x_0 + (points[:, 1] - y_0) * (x_1 - x_0) / (y_1 - y_0))
-        return inside
 
 
 def box_faces(half: Points) -> Faces:
@@ -253,8 +263,7 @@ def polygon_faces(corners: Points) -> Faces:
     """Return the edges of a polygon with corners (m, 2) [m], given clockwise or counterclockwise."""
     following = np.roll(corners, -1, axis=0)
     (x, y), (x_next, y_next) = (corners - corners[0]).T, (following - corners[0]).T
-    area = (x * y_next - x_next * y).sum()
-    ordered = corners if area > 0.0 else corners[::-1]
+    ordered = corners if (x * y_next - x_next * y).sum() > 0.0 else corners[::-1]
     numbers = np.arange(len(corners))
     return Faces(ordered, np.stack([numbers, np.roll(numbers, -1)], axis=1))
 
@@ -300,31 +309,6 @@ def _cut(start: Points, end: Points) -> Points:
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
-
-
-NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
-"""Nodes of three-point Gauss quadrature on the interval from 0 to 1."""
-WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
-
-
-def revolved_moments(edges: Points, axis: int) -> Moments:
-    """Return the moments of a solid of revolution, given the edges of its profile (k, 2, 2) [m] on one side of the
-    axis. The coordinates are radius and height. The edges run counterclockwise, and edges on the axis may be left out.
-    """
-    height = edges[..., 1].mean()
-    start, end = edges[:, 0], edges[:, 1]
-    x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
-
-    def integral(p: int, q: int) -> float:
-        """Return the integral of x^p (y - height)^q over the profile, with radius x and height y, by Green's
-        theorem."""
-        return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
-
-    volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[axis]
-    middle = integral(1, 1) / integral(1, 0)
-    across, upright = np.pi * integral(3, 0), 2.0 * np.pi * integral(1, 2) - volume * middle**2
-    second = across * np.eye(3) + (upright - across) * np.outer(along, along)
-    return Moments(volume, (height + middle) * along, second)
 
 
 def _standing(direction: Points) -> Points:

@@ -186,10 +186,20 @@ class Domain:
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
         """Return the translations between distinct images (m, k) [m], their inverse (k, m), and the shifts to all
         images within ``reach`` (i, k) [m]. Images are distinct if ``seen`` maps them to different points."""
-        lengths = np.array(self.lengths)
-        steps = _independent(seen(np.eye(len(lengths))), lengths) if lengths.any() else np.zeros((0, 0))
-        if not len(steps):
+        lengths, found = np.array(self.lengths), []
+        axes = seen(np.eye(len(lengths))) if lengths.any() else np.zeros((0, 0))
+        left = np.where(lengths[: len(axes), None] > 0.0, axes, 0.0)
+        for _ in axes:  # the longest independent translations first
+            sizes = np.linalg.norm(left, axis=1)
+            best = int(np.argmax(sizes))
+            if sizes[best] < ALONG:
+                break
+            unit = left[best] / sizes[best]
+            found.append(lengths[best] * axes[best])
+            left = left - np.outer(left @ unit, unit)
+        if not found:
             return np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((1, 1))
+        steps = np.array(found)
         inverse = np.linalg.pinv(steps)
         most = np.floor(reach * np.linalg.norm(inverse, axis=0) + 0.5).astype(int)
         turns = np.array(list(product(*(range(-k, k + 1) for k in most))), dtype=np.float64)
@@ -197,20 +207,6 @@ class Domain:
 
 
 WITHOUT_PERIODS = Domain((), ())
-
-
-def _independent(axes: Points, lengths: Points) -> Points:
-    """Return linearly independent translations between images (m, k), longest first."""
-    left, found = np.where(lengths[:, None] > 0.0, axes, 0.0), []
-    for _ in lengths:
-        sizes = np.linalg.norm(left, axis=1)
-        best = int(np.argmax(sizes))
-        if sizes[best] < ALONG:
-            break
-        unit = left[best] / sizes[best]
-        found.append(lengths[best] * axes[best])
-        left = left - np.outer(left @ unit, unit)
-    return np.array(found)
 
 
 @dataclass(frozen=True)
@@ -245,8 +241,7 @@ class Room:
         return within * np.clip(self.from_solids(points, 0.5 * spacing) / spacing + 0.5, 0.0, 1.0)
 
     def images(self, solid: Solid) -> list[Solid]:
-        turn = np.eye(self.dimension)
-        return [solid, *(Placed(solid, shift, turn) for shift in self.shifts()[1:])]
+        return [solid, *(Placed(solid, shift, np.eye(self.dimension)) for shift in self.shifts()[1:])]
 
     def shifts(self) -> list[Points]:
         """Return the shifts to periodic images (d,) [m]. The first shift is 0."""

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cortado.calls import point_in_words
 from cortado.discretise.smoothing import SmoothingKernel
 from cortado.errors import InputError
 
@@ -19,7 +20,6 @@ Numbers = NDArray[np.int64]
 
 ROUND_OFF = 1e-6
 """Tolerated round-off of a length when its cells are counted [spacings]."""
-
 NEARBY = 4
 EXCESS = 0.003
 """Greatest relative difference between the volume of a stretched lattice and the volume of its shape."""
@@ -167,7 +167,6 @@ def corners(lower: Points, upper: Points) -> Points:
 
 
 CHUNK = 8192
-
 Period = tuple[Points, Points]
 Pairs = tuple[Numbers, Numbers, Points]
 """Arrays (m,) of the first point, the second point and the distance [m] of each pair."""
@@ -187,17 +186,18 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
     some, others = (wrapped(x - np.asarray(lower, dtype=np.float64), lengths) for x in (some, others))
-    numbers = _around(some, others, reach, lengths)
+    numbers, beyond = np.arange(len(others)), reach * (1.0 + 1e-9)
+    if len(some) and not lengths.any():
+        first, last = some.min(axis=0) - beyond, some.max(axis=0) + beyond
+        numbers = np.flatnonzero(((others >= first) & (others <= last)).all(axis=1))
     tree = cKDTree(others[numbers], boxsize=lengths)
-    first, second, distances = [], [], []
+    parts = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
     for start in range(0, len(some), CHUNK):
         chunk = cKDTree(some[start : start + CHUNK], boxsize=lengths)
         found = chunk.sparse_distance_matrix(tree, reach, output_type="ndarray")
-        first.append(found["i"] + start)
-        second.append(numbers[found["j"]])
-        distances.append(found["v"])
-    none = np.zeros(0, dtype=np.int64)
-    return np.concatenate([none, *first]), np.concatenate([none, *second]), np.concatenate([np.zeros(0), *distances])
+        parts.append((found["i"] + start, numbers[found["j"]], found["v"]))
+    one, other, distances = map(np.concatenate, zip(*parts, strict=True))
+    return one, other, distances
 
 
 def apart(separations: Points, lengths: ArrayLike) -> Points:
@@ -207,16 +207,6 @@ def apart(separations: Points, lengths: ArrayLike) -> Points:
     if not lengths.any():
         return separations
     return np.asarray(separations - lengths * np.rint(separations / np.where(lengths > 0.0, lengths, np.inf)))
-
-
-def _around(some: Points, others: Points, reach: float, lengths: Points) -> Numbers:
-    """Return the indices of the points in ``others`` (m, d) [m] that may be within ``reach`` [m] of ``some`` (n, d)
-    [m]."""
-    if lengths.any() or not len(some):
-        return np.arange(len(others))
-    beyond = reach * (1.0 + 1e-9)
-    lower, upper = some.min(axis=0) - beyond, some.max(axis=0) + beyond
-    return np.flatnonzero(((others >= lower) & (others <= upper)).all(axis=1))
 
 
 def wrapped(positions: Points, lengths: Points) -> Points:
@@ -267,15 +257,14 @@ def check_crowding(
     seen = volume * kernel.weight(distances, positions.shape[1], support)
     densities = np.bincount(point, seen)  # relative to the lattice
     average, greatest = _compression(densities), densities.max()
-    inside = float(np.quantile(densities, 0.75))  # away from the surface
-    fit = spacing * inside ** (-1.0 / positions.shape[1])
+    fit = spacing * float(np.quantile(densities, 0.75)) ** (-1.0 / positions.shape[1])  # away from the surface
     advice = f"discretisation.spacing is {spacing:g} m, and these points would fit one of {fit:.3g} m"
     if average > MOST_AVERAGE_COMPRESSION or greatest > MOST_DENSITY:
         if len(bodies):
             _check_meeting(np.asarray(bodies), positions, point, other, seen)
-        place = ", ".join(f"{x:g}" for x in positions[densities.argmax()])
+        place = point_in_words(positions[densities.argmax()])
         raise InputError(
-            f"{what[0].upper()}{what[1:]} have {greatest:.3g} times the rest density at ({place}) m and are compressed "
+            f"{what[0].upper()}{what[1:]} have {greatest:.3g} times the rest density at {place} m and are compressed "
             f"by {average:.0%} on average, but must have at most {MOST_DENSITY:g} times and be compressed by at most "
             f"{MOST_AVERAGE_COMPRESSION:.0%}: {advice}."
         )
@@ -296,17 +285,16 @@ def _check_meeting(
     """Raise `InputError` if two bodies of fluid overlap. ``seen`` (k,) is the density contribution of each pair of
     particles."""
     foreign = bodies[point] != bodies[other]
-    together = np.bincount(point, seen)
-    added = np.bincount(point, seen * foreign)
+    together, added = np.bincount(point, seen), np.bincount(point, seen * foreign)
     alone = together - added
     if alone.max() > MOST_DENSITY or _compression(alone) > MOST_AVERAGE_COMPRESSION:
         return
     worst = int(np.argmax(np.where(added > 0.0, together, 0.0)))
     near = np.flatnonzero(foreign & (point == worst))
     second, first = sorted((bodies[worst], bodies[other[near[np.argmax(seen[near])]]]), reverse=True)
-    place = ", ".join(f"{x:g}" for x in positions[worst])
+    place = point_in_words(positions[worst])
     raise InputError(
-        f"{second} is overlapping {first} at ({place}) m, where both together have {together[worst]:.3g} times the "
+        f"{second} is overlapping {first} at {place} m, where both together have {together[worst]:.3g} times the "
         f"rest density, but must have at most {MOST_DENSITY:g} times, and be compressed by at most "
         f"{MOST_AVERAGE_COMPRESSION:.0%} on average: move one away from the other."
     )
@@ -318,10 +306,9 @@ def check_apart(what: str, positions: Points, spacing: float, period: Period) ->
     pairs = np.flatnonzero(first < second)
     if pairs.size:
         one, other = first[pairs[0]], second[pairs[0]]
-        place = ", ".join(f"{x:g}" for x in positions[one])
         raise InputError(
-            f"{what} has particles {one} and {other} at one place, ({place}) m, but must have them about a spacing, "
-            f"{spacing:g} m, apart."
+            f"{what} has particles {one} and {other} at one place, {point_in_words(positions[one])} m, but must have "
+            f"them about a spacing, {spacing:g} m, apart."
         )
 
 

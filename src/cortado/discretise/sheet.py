@@ -12,7 +12,7 @@ from cortado.discretise.room import Room
 from cortado.discretise.shapes import ROUND_OFF, Numbers, Points, Which, in_space, launch_on_cpu
 from cortado.discretise.solid import Faces, Solid, nearest_on_edges
 from cortado.discretise.solid_walls import DENSITY, WallPoints, frames, surface_points
-from cortado.discretise.walls import Places, RestLattice, WallLayers, wall_weights
+from cortado.discretise.walls import Places, RestLattice, wall_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,7 @@ class Sheet(Solid):
         return np.asarray(np.linalg.norm(points - self.nearest(points), axis=1))
 
     def nearest(self, points: Points) -> Points:
-        if points.shape[1] == 3:
-            return self._tree.nearest(points)[0]
-        return nearest_on_edges(points, self.pieces)
+        return self._tree.nearest(points)[0] if points.shape[1] == 3 else nearest_on_edges(points, self.pieces)
 
     def aside(self, points: Points, distance: float) -> Points:
         """Move points (n, d) [m] to a distance [m] from the sheet, without changing their side of the sheet. Points on
@@ -156,10 +154,10 @@ class Thickened(Solid):
         return Faces(vertices, np.concatenate([*both, *edges]))
 
 
-def sheet_points(sheet: Sheet, layers: WallLayers, lattice: RestLattice) -> WallPoints:
+def sheet_points(sheet: Sheet, lattice: RestLattice) -> WallPoints:
     """Build the wall particles of a sheet, on both sides and around its ends. Their depths are the depths of a flat
     wall's layers."""
-    apart = DENSITY * lattice.spacing
+    apart, layers = DENSITY * lattice.spacing, lattice.layers
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
     positions = np.concatenate([one.points for one in parts])
     shares = [weight * one.shares for weight, one in zip(layers.weights, parts, strict=True)]

@@ -61,10 +61,7 @@ CUBIC_SPLINE = SmoothingKernel(
     lambda q: np.where(q <= 0.5, 18 * q - 12, -6 * (1 - q) ** 2 / np.maximum(q, 0.5)),
 )
 WENDLAND_C2 = SmoothingKernel(
-    "wendland_c2",
-    (7 / pi, 21 / (2 * pi)),
-    lambda q: (1 - q) ** 4 * (1 + 4 * q),
-    lambda q: -20 * (1 - q) ** 3,
+    "wendland_c2", (7 / pi, 21 / (2 * pi)), lambda q: (1 - q) ** 4 * (1 + 4 * q), lambda q: -20 * (1 - q) ** 3
 )
 WENDLAND_C4 = SmoothingKernel(
     "wendland_c4",

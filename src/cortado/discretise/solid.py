@@ -1,12 +1,22 @@
 """Solids with faces and moments, in float64. Points are (n, d) [m]. Distances (n,) [m] are negative inside."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
 
 from cortado.discretise.shapes import Numbers, Points, whole_origin
+
+
+def rotation_matrix(rotation: Sequence[float]) -> Points:
+    """Return the matrix (d, d) of a rotation vector (3,) in 3-D or an angle (1,) in 2-D [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    if len(rotation) == 1:
+        return np.asarray(Rotation.from_rotvec([0.0, 0.0, rotation[0]]).as_matrix()[:2, :2])
+    return np.asarray(Rotation.from_rotvec(rotation).as_matrix())
 
 
 @dataclass(frozen=True)

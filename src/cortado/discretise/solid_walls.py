@@ -13,7 +13,7 @@ from cortado.device.threads import usable_cores
 from cortado.discretise.room import Room
 from cortado.discretise.shapes import Numbers, Points, Rows, Which, bisected, block_about
 from cortado.discretise.solid import Solid
-from cortado.discretise.walls import Places, RestLattice, WallLayers
+from cortado.discretise.walls import Places, RestLattice
 
 Near = Callable[[Points, float], Which]
 """A function that tests which points (n, d) [m] are closer than a length [m] to an object."""
@@ -50,9 +50,17 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
     points are above the surface. In thin parts of the solid the points are in the middle."""
     fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
-    points = feet - _reached(solid, feet, away, depth)[:, None] * away
+    points, tolerance = feet - depth * away, 1e-3 * depth
     if depth <= 0.0:
         points = points[np.abs(solid.distance_up_to(points, fine - depth) + depth) < 0.25 * fine]
+        return evenly_chosen(points, fine, spacing)
+    thin = np.flatnonzero(solid.distance_up_to(points, depth) >= -depth + tolerance)
+
+    def is_nearest(depths: Points) -> Which:
+        return solid.distance_up_to(feet[thin] - depths[:, None] * away[thin], depth) < -depths + tolerance
+
+    middles = bisected(is_nearest, np.zeros(len(thin)), np.full(len(thin), depth), HALVINGS)[0]
+    points[thin] = feet[thin] - middles[:, None] * away[thin]
     return evenly_chosen(points, fine, spacing)
 
 
@@ -77,9 +85,8 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
     moved = np.unique(_nearest(candidates, chosen)[1])
     kept = _chosen(candidates, moved, LEAST_APART * spacing, nothing)
     chosen = candidates[np.sort(_chosen(candidates, order, APART * spacing, kept))]
-    owner = _nearest(chosen, candidates)[1]
-    shares = np.bincount(owner, areas, len(chosen)) / spacing ** (dimension - 1)
-    return SurfacePoints(chosen, shares)
+    sizes = np.bincount(_nearest(chosen, candidates)[1], areas, len(chosen))
+    return SurfacePoints(chosen, sizes / spacing ** (dimension - 1))
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
@@ -108,21 +115,6 @@ def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tupl
     normals = np.stack(slopes, axis=1)
     away[on_it] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     return feet, away
-
-
-def _reached(solid: Solid, feet: Points, away: Points, depth: float) -> Points:
-    """Return the depths (n,) [m] below surface points (n, d) [m] down to which the surface point is the nearest one.
-    They are at most ``depth`` [m]."""
-    if depth <= 0.0:
-        return np.full(len(feet), depth)
-    found, tolerance = np.full(len(feet), depth), 1e-3 * depth
-    thin = np.flatnonzero(solid.distance_up_to(feet - depth * away, depth) >= -depth + tolerance)
-
-    def is_nearest(depths: Points) -> Which:
-        return solid.distance_up_to(feet[thin] - depths[:, None] * away[thin], depth) < -depths + tolerance
-
-    found[thin] = bisected(is_nearest, np.zeros(len(thin)), np.full(len(thin), depth), HALVINGS)[0]
-    return found
 
 
 def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
@@ -155,13 +147,26 @@ def _divided(cells: Points, size: float, parts: int) -> Points:
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
     """Choose more points, in the given ``order``, that are further than ``apart`` [m] from all ``chosen`` points.
     Return the indices of all chosen points."""
+    from scipy.spatial import cKDTree
+
     size = int(FIRST * len(order)) + 1
     while len(order):
         some, order, size = order[:size], order[size:], int(GROWTH * size) + 1
         if len(chosen):
             some = some[np.isinf(_nearest(points[chosen], points[some], apart)[0])]
-        if len(some):
-            chosen = np.append(chosen, some[_first_of_all_near(points[some], apart)])
+        if not len(some):
+            continue
+        first, second = cKDTree(points[some]).query_pairs(apart, output_type="ndarray").T
+        waits, stays = np.ones(len(some), dtype=bool), np.zeros(len(some), dtype=bool)
+        while waits.any():  # the first of every few that are near each other stay
+            active = waits[first] & waits[second]
+            first, second = first[active], second[active]
+            new = waits.copy()
+            new[second] = False
+            stays |= new
+            waits &= ~new
+            waits[second[new[first]]] = False
+        chosen = np.append(chosen, some[stays])
     return chosen
 
 
@@ -173,24 +178,6 @@ def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Point
     workers = usable_cores() if len(points) > MANY else 1
     distances, numbers = cKDTree(some).query(points, distance_upper_bound=reach, workers=workers)
     return distances, numbers
-
-
-def _first_of_all_near(points: Points, apart: float) -> Which:
-    """Test (n,) which points (n, d) [m] remain if points within ``apart`` [m] of an earlier remaining point are
-    removed."""
-    from scipy.spatial import cKDTree
-
-    first, second = cKDTree(points).query_pairs(apart, output_type="ndarray").T
-    open_, stays = np.ones(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-    while open_.any():
-        active = open_[first] & open_[second]
-        first, second = first[active], second[active]
-        new = open_.copy()
-        new[second] = False
-        stays |= new
-        open_ &= ~new
-        open_[second[new[first]]] = False
-    return stays
 
 
 @dataclass(frozen=True)
@@ -296,11 +283,11 @@ class ExposedSurface:
 
         return cKDTree(self.feet)
 
-    def walls(self, layers: WallLayers, lattice: RestLattice) -> WallPoints:
+    def walls(self, lattice: RestLattice) -> WallPoints:
         """Build wall particles at the depths of a flat wall's layers. The weight of a wall particle is proportional to
         its area, and is reduced near the surface."""
         parts, spacing = [], lattice.spacing
-        for depth, weight in zip(layers.depths, layers.weights, strict=True):
+        for depth, weight in zip(lattice.layers.depths, lattice.layers.weights, strict=True):
             found = self.beneath(depth)
             feet = self._feet_of(found.points, *self._tree.query(found.points)) - found.points
             found_depths = np.minimum(np.linalg.norm(feet, axis=1) / spacing, depth / spacing + TOLERANCE)
@@ -317,10 +304,12 @@ class ExposedSurface:
     def beneath(self, depth: float) -> SurfacePoints:
         """Return points about a spacing apart, ``depth`` [m] below the surface or in the middle of thinner parts.
         Points near the container's kept wall particles are left out."""
-        points = np.concatenate([self._at(depth), self._in_the_middle(depth)])
-        points = points[
-            _within_a_period(points, self.lower, self.container.room.periods, 0.0) & ~self.container.keeps(points)
-        ]
+        thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
+        ends = np.zeros(len(thin)), np.full(len(thin), depth)
+        low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
+        points = np.concatenate([self._at(depth), self.feet[thin] - low[:, None] * self.away[thin]])
+        within = _within_a_period(points, self.lower, self.container.room.periods, 0.0)
+        points = points[within & ~self.container.keeps(points)]
         found = evenly_chosen(points, self._fine, DENSITY * self.container.spacing)
         return SurfacePoints(found.points, found.shares * DENSITY ** (points.shape[1] - 1))
 
@@ -382,13 +371,6 @@ class ExposedSurface:
         near = np.linalg.norm(found - feet, axis=1) < self.container.spacing
         near &= self._tree.query(found)[0] < EDGE * self.container.spacing  # not where one covers the other
         return np.where(near[:, None], found, feet)
-
-    def _in_the_middle(self, depth: float) -> Points:
-        """Return points (n, d) [m] in the middle of parts that are too thin for points at ``depth`` [m]."""
-        thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
-        ends = np.zeros(len(thin)), np.full(len(thin), depth)
-        low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
-        return np.asarray(self.feet[thin] - low[:, None] * self.away[thin])
 
     def _is_nearest(self, which: Any, depths: Points) -> np.ndarray:
         distances = self._tree.query(self.feet[which] - depths[:, None] * self.away[which])[0]

@@ -108,8 +108,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
     ends = closed[np.minimum(closed, height - closed) < reach] if lid else closed[closed < reach]
     radii = radius - spacing * (np.arange(max(int(np.ceil(reach / spacing)), 1)) + 0.5)
     rings = [ring(value, spacing) for value in radii[radii > 0.0]]
-    flat = np.concatenate([np.zeros((0, 2)), *rings])
-    side = stacked(flat, closed)
+    side = stacked(np.concatenate([np.zeros((0, 2)), *rings]), closed)
     outward = np.pad(side[:, :2] / np.linalg.norm(side[:, :2], axis=1, keepdims=True), ((0, 0), (0, 1)))
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), side.shape)
     middle = disc(radius, spacing, 2)
@@ -161,6 +160,16 @@ SHALLOW = 0.4
 
 
 @dataclass(frozen=True)
+class WallLayers:
+    """Layers of wall particles behind a flat wall, from the shallowest to the deepest."""
+
+    depths: tuple[float, ...]
+    """Distances of the layers behind the surface [m]."""
+    weights: tuple[float, ...]
+    """Weight in the density of a wall particle in each layer, relative to a fluid particle."""
+
+
+@dataclass(frozen=True)
 class RestLattice:
     kernel: SmoothingKernel
     spacing: float
@@ -193,56 +202,45 @@ class RestLattice:
         """Return the sum of the smoothing kernel over a lattice plane at a distance [m] [1 / m^d]."""
         return float(self.weights(self._to_plane(distance)).sum())
 
-    def plane_slope(self, distance: float) -> float:
-        """Return the derivative of `plane_weight` with respect to the distance [1 / m^(d + 1)]."""
-        return float(self.kernel.gradient(self._to_plane(distance), self.support)[:, 0].sum())
+    @cached_property
+    def layers(self) -> WallLayers:
+        """Layers of wall particles at a flat wall. The first layer of fluid is half a spacing from the wall. The layers
+        meet two conditions:
 
+        - The first and second layer of fluid have the rest density. Band et al. (2018) scale volumes for this purpose.
+        - A uniform pressure pushes no particle of the first layer. The wall's density contribution is steep enough to
+          balance the pressures of the particle and its neighbours.
 
-@dataclass(frozen=True)
-class WallLayers:
-    """Layers of wall particles behind a flat wall, from the shallowest to the deepest."""
+        One layer is enough if the second layer of fluid does not reach the wall, as with support radii of up to two
+        spacings.
+        """
+        from scipy.optimize import brentq
 
-    depths: tuple[float, ...]
-    """Distances of the layers behind the surface [m]."""
-    weights: tuple[float, ...]
-    """Weight in the density of a wall particle in each layer, relative to a fluid particle."""
+        spacing, support, weight = self.spacing, self.support, self.plane_weight
 
+        def slope(distance: float) -> float:
+            return float(self.kernel.gradient(self._to_plane(distance), support)[:, 0].sum())
 
-def wall_layers(lattice: RestLattice) -> WallLayers:
-    """Find the layers of wall particles at a flat wall. The first layer of fluid is half a spacing from the wall. The
-    layers meet two conditions:
+        below = spacing * np.arange(1, int(support / spacing) + 2)  # the lattice planes that the first layer misses
+        missing = np.array([sum(map(weight, below)), sum(map(weight, below[1:]))])
+        pull = 2.0 * sum(map(slope, below))
+        heights = spacing * np.array([0.5, 1.5])
+        two = missing[1] > 1e-6 * missing[0]
 
-    - The first and second layer of fluid have the rest density. Band et al. (2018) scale volumes for this purpose.
-    - A uniform pressure pushes no particle of the first layer. The wall's density contribution is steep enough to
-      balance the pressures of the particle and its neighbours.
+        def depths(deepest: float) -> np.ndarray:
+            return np.array([SHALLOW * spacing, deepest] if two else [deepest])
 
-    One layer is enough if the second layer of fluid does not reach the wall, as with support radii of up to two
-    spacings.
-    """
-    spacing, support, weight, slope = lattice.spacing, lattice.support, lattice.plane_weight, lattice.plane_slope
-    below = spacing * np.arange(1, int(support / spacing) + 2)  # the lattice planes that the first layer misses
-    missing = np.array([sum(map(weight, below)), sum(map(weight, below[1:]))])
-    pull = 2.0 * sum(map(slope, below))
-    heights = spacing * np.array([0.5, 1.5])
+        def weights(deepest: float) -> np.ndarray:
+            layers = depths(deepest)
+            seen = [[weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
+            return np.linalg.solve(np.array(seen), missing[: len(layers)])
 
-    two = missing[1] > 1e-6 * missing[0]
+        def push(deepest: float) -> float:
+            slopes = [slope(heights[0] + depth) for depth in depths(deepest)]
+            return float(weights(deepest) @ slopes - pull)
 
-    def depths(deepest: float) -> np.ndarray:
-        return np.array([SHALLOW * spacing, deepest] if two else [deepest])
-
-    def weights(deepest: float) -> np.ndarray:
-        layers = depths(deepest)
-        seen = [[weight(height + depth) for depth in layers] for height in heights[: len(layers)]]
-        return np.linalg.solve(np.array(seen), missing[: len(layers)])
-
-    def push(deepest: float) -> float:
-        slopes = [slope(heights[0] + depth) for depth in depths(deepest)]
-        return float(weights(deepest) @ slopes - pull)
-
-    from scipy.optimize import brentq
-
-    deepest = brentq(push, 0.5 * spacing, support - (0.5 + 1e-3) * spacing, xtol=1e-14 * spacing)
-    return WallLayers(tuple(depths(deepest).tolist()), tuple(weights(deepest).tolist()))
+        deepest = brentq(push, 0.5 * spacing, support - (0.5 + 1e-3) * spacing, xtol=1e-14 * spacing)
+        return WallLayers(tuple(depths(deepest).tolist()), tuple(weights(deepest).tolist()))
 
 
 STIFFNESS = 3e-3
@@ -257,8 +255,6 @@ weights make corners too dense."""
 RAISED = 3.0
 """Height above a solid where free room is measured [spacings]."""
 CHUNK = 4096
-
-
 Crossed = Callable[[Points, Points], Which]
 """A function that tests which line segments between two arrays of points (n, d) [m] cross a sheet."""
 
@@ -296,7 +292,7 @@ def wall_weights(
     """Compute the weights of wall particles in the density (b,) [-], relative to a fluid particle.
 
     The weights are fitted by least squares to two conditions. The lattice has the rest density at all places. A uniform
-    pressure pushes no particle less than a spacing from a wall, as in `wall_layers`.
+    pressure pushes no particle less than a spacing from a wall, as in `RestLattice.layers`.
 
     Args:
         walls: (b, d) wall particles [m].

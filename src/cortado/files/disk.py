@@ -13,7 +13,7 @@ import socket
 import stat
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,8 +51,7 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
     if not stat.S_ISREG(found.st_mode):
         kind = next((words for is_kind, words in OTHERS if is_kind(found.st_mode)), "something else")
         raise OSError(errno.EINVAL, f"it is {kind}, but must be a regular file")
-    if found.st_size > most:
-        raise _too_large(found.st_size, most)
+    _check_size(found.st_size, most)
     return found
 
 
@@ -80,18 +79,18 @@ def content(path: str | os.PathLike[str], most: int) -> bytes:
     regular_file(path, most)
     with open(path, "rb") as file:
         found = file.read(most + 1)
-    if len(found) > most:  # it grew, or the system makes it up as it is read
-        raise _too_large(len(found), most)
+    _check_size(len(found), most)  # it grew, or the system makes it up as it is read
     return found
+
+
+def _check_size(size: int, most: int) -> None:
+    if size > most:
+        raise OSError(errno.EFBIG, f"it has {size:,} bytes, but must have at most {most:,}")
 
 
 def reason(problem: BaseException) -> str:
     text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
     return " ".join(text.split()).rstrip(".")
-
-
-def _too_large(size: int, most: int) -> OSError:
-    return OSError(errno.EFBIG, f"it has {size:,} bytes, but must have at most {most:,}")
 
 
 MOST_BYTES = 2**28
@@ -261,17 +260,15 @@ def locked(folder: Path) -> Iterator[None]:
 def _open_locked(path: Path) -> int:
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-        try:
+        with ExitStack() as stack:
+            stack.callback(os.close, file)
             _lock(file, path.parent)
             if _is_at(path, file):
                 with suppress(OSError):  # a full disk: the lock holds without the name
                     os.ftruncate(file, 0)
                     os.write(file, f"process {os.getpid()} on {socket.gethostname()}".encode())
+                stack.pop_all()
                 return file
-        except BaseException:
-            os.close(file)
-            raise
-        os.close(file)
 
 
 def _lock(file: int, folder: Path) -> None:

@@ -172,13 +172,8 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True),
-        TextColumn("{task.fields[shown]}", style="dim"),
-    )
+    left, values = TimeRemainingColumn(elapsed_when_finished=True), TextColumn("{task.fields[shown]}", style="dim")
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), left, values
     with Progress(*columns, console=Console(file=stream)) as progress:
         task = progress.add_task(description, total=total, shown="")
 

@@ -124,9 +124,9 @@ class FileLayout:
             own.attrs["origin"] = self.origin
         if self.marks:
             own.attrs["marks"] = np.array(self.marks)
-        group = own.create_group("constants")
+        constants = own.create_group("constants")
         for name, array in self.constants.items():
-            group[name] = array
+            constants[name] = array
         own["progress"] = np.array([[0, self.seed], [0, steps_seed(self.records)]], np.uint32)
         places = {"cortado/progress": own["progress"].id.get_offset()}
         places["cortado/frame_steps"] = _reserve(own, "frame_steps", (len(self.times),), np.int64)
@@ -152,10 +152,8 @@ class FileLayout:
             group["Connectivity"], group["Offsets"] = np.arange(cells), np.append(np.arange(cells + 1), 0)
         series = vtk.create_group("Steps")
         series.attrs["NSteps"] = np.int64(frames)
-        series["Values"] = self.times
-        series["PartOffsets"] = np.full(frames, MISSING)
-        series["NumberOfParts"] = np.ones(frames, np.int64)
-        series["PointOffsets"] = np.arange(frames) * particles
+        series["Values"], series["PartOffsets"] = self.times, np.full(frames, MISSING)
+        series["NumberOfParts"], series["PointOffsets"] = np.ones(frames, np.int64), np.arange(frames) * particles
         for name in ("CellOffsets", "ConnectivityIdOffsets"):
             series[name] = np.zeros((frames, len(_TOPOLOGIES)), np.int64)
         for name in ("velocity", *self.scalars, *self.vectors):
@@ -252,7 +250,13 @@ class TrajectoryWriter:
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)
         with sentences(self.path):
-            _require_room(self._layout, self.path, expected)
+            free, most = shutil.disk_usage(self.path.absolute().parent).free, len(self._layout.times)
+            frames = most if expected is None else min(expected, most)
+            if (needed := self._layout.size * frames / most) > free:
+                raise ComputationError(
+                    f"{path} needs {needed / 1e6:.4g} MB for {frames} frames, but {free / 1e6:.4g} MB are free on its "
+                    "disk; record fewer frames, free some space, or choose another place."
+                )
             self._file = open(self._unfinished, "x+b", buffering=0)  # noqa: SIM115
             try:
                 pages, self._places = self._layout.create()
@@ -279,12 +283,11 @@ class TrajectoryWriter:
         frame, frames = self.frames_written, len(self._layout.times)
         if frame >= frames:
             raise InputError(f"{self.path} has room for {frames} frames, but one more was given.")
-        for what, found, wanted in (
-            ("scalar fields", scalars, (*self._layout.scalars, *self._layout.vectors)),
-            ("other fields", others or {}, self._layout.others),
-        ):
+        named = (*self._layout.scalars, *self._layout.vectors)
+        others = others or {}
+        for what, found, wanted in ("scalar", scalars, named), ("other", others, self._layout.others):
             if set(found) != set(wanted):
-                raise InputError(f"Expected the {what} {sorted(wanted)}, found {sorted(found)}.")
+                raise InputError(f"Expected the {what} fields {sorted(wanted)}, found {sorted(found)}.")
         own = {"VTKHDF/Points": self._row("positions", positions)}
         own["VTKHDF/PointData/velocity"] = self._row("velocities", velocities)
         for name, values in scalars.items():
@@ -292,8 +295,7 @@ class TrajectoryWriter:
         number = np.int64(frame if step is None else step)
         rows = {name: own[name] for name in self._layout.rows}
         for name, first in sorted(self._layout.others.items()):
-            array = _checked(name, (others or {})[name], first.dtype, first.shape)
-            rows[f"cortado/states/{name}"] = array.tobytes()
+            rows[f"cortado/states/{name}"] = _checked(name, others[name], first.dtype, first.shape).tobytes()
         moment = self._layout.times[frame] if time is None else np.float64(time)
         checksum = frame_checksum(self._frames_checksum, moment, number, rows.values())
         with self._refusal():
@@ -405,11 +407,9 @@ def _read_arrays(file: Any, size: int) -> dict[str, Any] | None:
     record = np.dtype([(name, column.dtype) for name, column in diagnostics.items()])
     points = {name: dataset[: frames * particles] for name, dataset in rows.items()}
     points = {name: field.reshape(frames, particles, *field.shape[1:]) for name, field in points.items()}
-
     fields = points | others
     kinds = {name: (field.dtype, field.shape[1:]) for name, field in fields.items()}
-    origin = str(own.attrs.get("origin", ""))
-    marks = tuple(map(float, own.attrs.get("marks", ())))
+    origin, marks = str(own.attrs.get("origin", "")), tuple(map(float, own.attrs.get("marks", ())))
     checksum = frames_seed((particles, dimension), kinds, constants, origin, marks)
     for k in range(frames):
         checksum = frame_checksum(checksum, times[k], numbers[k], [field[k].tobytes() for field in fields.values()])
@@ -436,13 +436,3 @@ def _records(columns: Mapping[str, ArrayLike], record: np.dtype[Any]) -> NDArray
     for name, array in arrays.items():
         records[name] = array
     return records
-
-
-def _require_room(layout: FileLayout, path: Path, expected: int | None) -> None:
-    free, most = shutil.disk_usage(path.absolute().parent).free, len(layout.times)
-    frames = most if expected is None else min(expected, most)
-    if (needed := layout.size * frames / most) > free:
-        raise ComputationError(
-            f"{path} needs {needed / 1e6:.4g} MB for {frames} frames, but {free / 1e6:.4g} MB are "
-            f"free on its disk; record fewer frames, free some space, or choose another place."
-        )

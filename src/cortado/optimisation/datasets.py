@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from cortado.discretise.shapes import wrapped
+from cortado.discretise.solid import rotation_matrix
 from cortado.errors import InputError
 from cortado.losses import FinalPositions
 from cortado.particles.state import State
@@ -19,7 +20,7 @@ from cortado.runs.frames import SolidMotion
 from cortado.scene.motions import wall_numbers
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.scene import Scene
-from cortado.scene.tables import Flag, Table, Text, count, field_error, quantity, rotation_matrix
+from cortado.scene.tables import Flag, Table, Text, count, field_error, quantity
 from cortado.simulation import Simulation
 
 PAIR = "a lower and an upper end of the same shape, each a number or a list of numbers"

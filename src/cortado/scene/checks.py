@@ -4,26 +4,22 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from pydantic_core import PydanticCustomError
 
 from cortado.calls import point_in_words
 from cortado.device.threads import sampling_parts, shortage
 from cortado.discretise.mesh_files import read_mesh
 from cortado.discretise.room import TOLERANCE
-from cortado.discretise.shapes import Points, corners
+from cortado.discretise.shapes import Points, corners, grid
 from cortado.discretise.smoothing import CUBIC_SPLINE
-from cortado.discretise.solid import Solid
 from cortado.errors import Words, shown
 from cortado.scene.drain_tables import check_drains
 from cortado.scene.emitter_table import EmitterTable, check_columns, check_fed
 from cortado.scene.fluids import Fluid, FluidBody, PointsFluid
-from cortado.scene.links import check_hinges, check_springs
+from cortado.scene.links import check_free_body, check_hinges, check_springs
 from cortado.scene.model import MixtureTable, SceneTables
 from cortado.scene.motions import free
 from cortado.scene.parameters import BY_NAME
 from cortado.scene.shape_tables import MeshShape, check_length
-from cortado.scene.solids import check_free_body
-from cortado.scene.stability import chosen_limits
 from cortado.scene.tables import MISSING, FieldPath, check_name, field_error, field_name, usable_file
 
 DEEPEST = 0.25
@@ -48,12 +44,15 @@ def check_free_bodies(scene: SceneTables) -> None:
     for index, table in enumerate(scene.solid):
         if table.motion != "free":
             continue
-        points = _points_within(table.solid(), FINE * spacing)
+        solid, step = table.solid(), FINE * spacing
+        ends = zip(*solid.extent(), strict=True)
+        lattice = grid([np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in ends])
+        points = np.concatenate([solid.faces(step).vertices, lattice[solid.distance(lattice) < 0.0]])
         depths = [("the container", scene.region.distance(points))]
         for other in scene.solid:
             if other is not table:
-                near = _nearest_images(points, np.mean(other.solid().extent(), axis=0), lengths)
-                depths.append((f"the solid {other.name!r}", -other.solid().distance(near)))
+                away = np.round((points - np.mean(other.solid().extent(), axis=0)) / np.where(lengths, lengths, np.inf))
+                depths.append((f"the solid {other.name!r}", -other.solid().distance(points - lengths * away)))
         for name, depth in depths:
             if depth.max() > DEEPEST * spacing:
                 place = point_in_words(points[depth.argmax()])
@@ -80,20 +79,6 @@ def _check_solver(scene: SceneTables, why: str, and_why: str = "") -> None:
         raise field_error(("solver", "kind"), scene.solver.kind, f'"projection", {why}{and_why}')
     if not scene.forces.pressure:
         raise field_error(("forces", "pressure"), False, f"true, {why}")
-
-
-def _nearest_images(points: Points, middle: Points, lengths: Points) -> Points:
-    """Return the periodic images (n, d) that are nearest to the point ``middle`` (d,). A length of 0 means no
-    period."""
-    periods = np.where(lengths > 0.0, lengths, np.inf)
-    return points - np.where(lengths > 0.0, lengths * np.round((points - middle) / periods), 0.0)
-
-
-def _points_within(solid: Solid, step: float) -> Points:
-    """Return the vertices of a solid and lattice points inside the solid, (n, d)."""
-    sides = [np.linspace(a, b, min(int((b - a) / step) + 2, MOST)) for a, b in zip(*solid.extent(), strict=True)]
-    points = np.stack([axis.ravel() for axis in np.meshgrid(*sides, indexing="ij")], axis=-1)
-    return np.concatenate([solid.faces(step).vertices, points[solid.distance(points) < 0.0]])
 
 
 NEAREST = 0.5
@@ -147,7 +132,9 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
     for points, body in ((other, one), (one, other)):
         tree = cKDTree(body)
         close = points[tree.query(points)[0] < spacing * (1.0 - 1e-6)]
-        density = _density(tree, close, spacing)
+        distances = tree.query(close, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
+        weights = CUBIC_SPLINE.weight(distances, close.shape[1], SUPPORT * spacing)
+        density = spacing ** close.shape[1] * weights.sum(axis=1)
         if density.max(initial=0.0) > DENSEST:
             return close[np.argmax(density)]
     return None
@@ -156,12 +143,6 @@ def _meeting(first: FluidBody, second: FluidBody, shift: Points, spacing: float)
 def _near(points: Points, extent: Any, spacing: float) -> Points:
     reach = SUPPORT * spacing
     return points[((points > extent[0] - reach) & (points < extent[1] + reach)).all(axis=1)]
-
-
-def _density(tree: Any, points: Points, spacing: float) -> np.ndarray:
-    dimension = points.shape[1]
-    distances = tree.query(points, k=NEIGHBOURS, distance_upper_bound=SUPPORT * spacing)[0]
-    return spacing**dimension * CUBIC_SPLINE.weight(distances, dimension, SUPPORT * spacing).sum(axis=1)
 
 
 def _overlap(other: str, place: Points, spacing: float) -> tuple[Words, str]:
@@ -180,24 +161,20 @@ def check_scene(scene: SceneTables) -> None:
         found = Words("empty") if "fluid" in scene.model_fields_set else MISSING
         raise field_error(("fluid",), found, "a list of at least one table, as there is no emitter")
     _check_phases(scene)
-    _check_files(scene)
-    _check_counts(scene)
-    for index, fluid in enumerate(scene.fluid):
-        if fluid.count(spacing) == 0.0:
-            wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
-            raise field_error(("fluid", index), Words("too thin to hold a particle"), wanted)
-    for index, emitter in enumerate(scene.emitter):
-        if emitter.length is not None and emitter.layers(spacing) == 0.0:
-            wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
-            raise field_error(("emitter", index, "length"), emitter.length, wanted)
+    _check_files_and_counts(scene)
     for path, body in _bodies(scene):
+        if body.count(spacing) == 0.0:
+            wanted = f"at least one spacing, {spacing:g} m, wide along every axis"
+            raise field_error(path, Words("too thin to hold a particle"), wanted)
+        if isinstance(body, EmitterTable) and body.length is not None and body.layers(spacing) == 0.0:
+            wanted = f"greater than half a spacing, {0.5 * spacing:g} m, for the column to hold a layer of particles"
+            raise field_error((*path, "length"), body.length, wanted)
         _check_near(path, body.extent(spacing), spacing)
     check_length(scene.container, spacing, scene.discretisation.support_radius)
     if (ends := scene.container.extent()) is not None:
         _check_near(("container",), ends, spacing)
     for index, solid in enumerate(scene.solid):
         _check_near(("solid", index), solid.body().extent(), spacing)
-    for index, solid in enumerate(scene.solid):
         least = solid.least_thickness * spacing
         if solid.side == "outside" and (thickness := solid.thinnest(spacing)) < least * (1.0 - 1e-6):
             found, of = Words(f"only {thickness:g} m thick"), "one spacing" if least == spacing else "half a spacing"
@@ -210,7 +187,10 @@ def check_scene(scene: SceneTables) -> None:
     check_fed(scene)
     check_sheets(scene)
     check_columns(scene)
-    _check_names(scene)
+    for key in ("solid", "emitter", "drain", "spring", "hinge", "sensor"):
+        for index, table in enumerate(getattr(scene, key)):
+            if "/" in (table.name or ""):
+                raise field_error((key, index, "name"), table.name, 'without "/"')
     _check_sensors(scene)
     for index, fluid in enumerate(scene.fluid):
         _check_inside(scene, index, fluid)
@@ -223,23 +203,9 @@ def check_scene(scene: SceneTables) -> None:
     _check_schedule(scene)
 
 
-def check_bounded(scene: SceneTables) -> None:
-    if not np.isfinite(min(chosen_limits(scene).values())):
-        wanted = "given, as nothing else bounds the time step of this scene where the fluid rests"
-        raise field_error(("solver", "greatest_time_step"), MISSING, wanted)
-
-
 def _bodies(scene: SceneTables) -> list[tuple[FieldPath, FluidBody]]:
     fluids: list[tuple[FieldPath, FluidBody]] = [(("fluid", index), fluid) for index, fluid in enumerate(scene.fluid)]
     return [*fluids, *((("emitter", index), emitter) for index, emitter in enumerate(scene.emitter))]
-
-
-def _check_names(scene: SceneTables) -> None:
-    """Check that names contain no "/"."""
-    for key in ("solid", "emitter", "drain", "spring", "hinge", "sensor"):
-        for index, table in enumerate(getattr(scene, key)):
-            if "/" in (table.name or ""):
-                raise field_error((key, index, "name"), table.name, 'without "/"')
 
 
 def _check_phases(scene: SceneTables) -> None:
@@ -284,7 +250,7 @@ def _check_sensors(scene: SceneTables) -> None:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the sensor is on no solid')
 
 
-def _check_files(scene: SceneTables) -> None:
+def _check_files_and_counts(scene: SceneTables) -> None:
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     for name, tables, reach in (("solid", scene.solid, support), ("fluid", scene.fluid, None)):
         for index, table in enumerate(tables):
@@ -295,58 +261,50 @@ def _check_files(scene: SceneTables) -> None:
         if isinstance(fluid, PointsFluid):
             with usable_file(("fluid", index, "file"), fluid.file, "a file of positions"):
                 fluid.points()
-
-
-def _check_counts(scene: SceneTables) -> None:
-    spacing = scene.discretisation.spacing
-    fluid = sum(body.count(spacing) for _, body in _bodies(scene))
+    particles = sum(body.count(spacing) for _, body in _bodies(scene))
     walls = scene.container.wall_count(spacing) + sum(solid.wall_count(spacing) for solid in scene.solid)
-    for count, what in ((fluid, "particles of fluid"), (walls, "wall particles")):
+    for count, what in ((particles, "particles of fluid"), (walls, "wall particles")):
         if count > MOST_PARTICLES:
             wanted = f"so large that there are at most {MOST_PARTICLES:.0e} {what}, not about {count:.1e}"
             raise field_error(("discretisation", "spacing"), spacing, wanted)
-    lack = shortage(sampling_parts(fluid, walls))
-    if lack:
+    if lack := shortage(sampling_parts(particles, walls)):
         wanted = f"larger, or the fluid and the container smaller: the scene needs {lack}"
         raise field_error(("discretisation", "spacing"), spacing, wanted)
 
 
 def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
-    furthest = np.abs(ends).max()
-    if furthest > FURTHEST * spacing:
-        wanted = f"within {FURTHEST:g} spacings of {spacing:g} m"
-        raise field_error(path, Words(f"{furthest:g} m from the origin"), wanted)
+    if (furthest := np.abs(ends).max()) > FURTHEST * spacing:
+        found = Words(f"{furthest:g} m from the origin")
+        raise field_error(path, found, f"within {FURTHEST:g} spacings of {spacing:g} m")
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
     """Check that a body of fluid is inside the container."""
     spacing = scene.discretisation.spacing
-    if scene.container.contains(corners(*fluid.extent(spacing)), 1e-6 * spacing).all():
+    tolerance, (lower, upper) = 1e-6 * spacing, fluid.extent(spacing)
+    if scene.container.contains(corners(lower, upper), tolerance).all():
         return
-    region, (lower, upper) = scene.container.region(scene.dimension), fluid.extent(spacing)
+    region, place = scene.container.region(scene.dimension), 0.5 * (lower + upper)
     for ends, beyond in ((lower, region.lower - lower), (upper, upper - region.upper)):
         axis = int(np.argmax(beyond))
-        if beyond[axis] > 1e-6 * spacing:
-            place = 0.5 * (lower + upper)
+        if beyond[axis] > tolerance:
             place[axis] = ends[axis]
-            raise _outside(index, place)
-    witnesses = fluid.witnesses(spacing)
-    outside = ~scene.container.contains(witnesses, 1e-6 * spacing)
-    if outside.any():
-        raise _outside(index, witnesses[outside][0])
+            break
+    else:
+        particles = fluid.particles(spacing)
+        outside = ~scene.container.contains(particles, tolerance)
+        if not outside.any():
+            return
+        place = particles[outside][0]
+    found = Words(f"partly outside, for example at {point_in_words(place)}")
+    raise field_error(("fluid", index), found, "inside the container")
 
 
 def _check_outside_solids(scene: SceneTables, path: FieldPath, points: Points) -> None:
-    tolerance, room = TOLERANCE * scene.discretisation.spacing, scene.room
-    within = room.from_solids(points) < -tolerance
+    within = scene.room.from_solids(points) < -TOLERANCE * scene.discretisation.spacing
     if within.any():
         found = Words(f"partly in a solid, for example at {point_in_words(points[within][0])}")
         raise field_error(path, found, "outside of solids")
-
-
-def _outside(index: int, place: Points) -> PydanticCustomError:
-    found = Words(f"partly outside, for example at {point_in_words(place)}")
-    return field_error(("fluid", index), found, "inside the container")
 
 
 def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) -> None:
@@ -390,10 +348,9 @@ def _check_schedule(scene: SceneTables) -> None:
             raise field_error(("schedule", name), Words("given"), f"left out, as the scene {BY_NAME[name].absent}")
     if "gravity" in courses and "tilt" in courses:
         raise field_error(("schedule", "gravity"), Words("given"), "left out, as the tilt says where gravity points")
-    usual = type(scene.forces).model_fields["gravity"].default[: scene.dimension]
-    if "gravity" in courses and scene.forces.gravity not in (
-        usual,
-        first := tuple(courses["gravity"].values[0].tolist()),
-    ):
-        wanted = f"left out, or {shown(first)}, with which schedule.gravity begins, as that acts in its place"
-        raise field_error(("forces", "gravity"), scene.forces.gravity, wanted)
+    if "gravity" in courses:
+        usual = type(scene.forces).model_fields["gravity"].default[: scene.dimension]
+        first = tuple(courses["gravity"].values[0].tolist())
+        if scene.forces.gravity not in (usual, first):
+            wanted = f"left out, or {shown(first)}, with which schedule.gravity begins, as that acts in its place"
+            raise field_error(("forces", "gravity"), scene.forces.gravity, wanted)

@@ -61,7 +61,13 @@ class Knots:
     def rates(self, times: NDArray) -> NDArray:
         """Return time derivatives, (n,) or (n, components), at times (n,) [s]. At a kink, return the derivative after
         the kink."""
-        found = self._slopes(times)
+        if self.interpolation == "spline" and len(self.times) > 1:
+            found = np.asarray(self._spline(times, 1)).T
+            found = np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
+        else:
+            lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
+            slopes = np.concatenate([np.diff(self.values, axis=0) / lengths, np.zeros_like(self.values[:1])])
+            found = slopes[np.searchsorted(self.times, times, side="right") - 1]
         if not self.ramp:
             return found
         weights, growth = self._weights(times)
@@ -95,14 +101,6 @@ class Knots:
         found = np.stack([np.interp(times, self.times, column) for column in columns], axis=-1)
         return found.reshape(len(times), *self.values.shape[1:])
 
-    def _slopes(self, times: NDArray) -> NDArray:
-        if self.interpolation == "spline" and len(self.times) > 1:
-            found = np.asarray(self._spline(times, 1)).T
-            return np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
-        lengths = np.diff(self.times).reshape(-1, *(1,) * (self.values.ndim - 1))
-        slopes = np.concatenate([np.diff(self.values, axis=0) / lengths, np.zeros_like(self.values[:1])])
-        return slopes[np.searchsorted(self.times, times, side="right") - 1]
-
     def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
         """Return the factor of the ramp and its time derivative [1/s]."""
         s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
@@ -114,8 +112,7 @@ def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.
     of the curves ``moved``, each multiplied by its factor."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
-    most = sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1)
-    return np.append(most, 0.0)
+    return np.append(sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1), 0.0)
 
 
 def _within(times: NDArray) -> NDArray[np.float64]:
@@ -199,8 +196,6 @@ def lists_in_file(table: Any, path: FieldPath, columns: Columns, what: str, need
 
 
 WAYS = {2: ("x", "y", "rotation"), 3: ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")}
-
-
 Rows = NDArray[np.float64]
 
 
@@ -213,8 +208,10 @@ def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None]
         return np.array(solid.times), _since_first(solid.positions), _since_first(solid.rotations)
     columns = tuple((way, "m" if k < dimension else "rad") for k, way in enumerate(WAYS[dimension]))
     times, found = values_in_file(solid.path, columns, False)
-    names = WAYS[dimension]
-    shifts, turns = (_stacked(found, some, len(times)) for some in (names[:dimension], names[dimension:]))
+    shifts, turns = (
+        None if found.keys().isdisjoint(some) else np.stack([found.get(one, 0.0 * times) for one in some], axis=1)
+        for some in (WAYS[dimension][:dimension], WAYS[dimension][dimension:])
+    )
     if turns is not None and np.count_nonzero(turns.any(axis=0)) > 1 and turns[0].any():
         raise InputError(f"{solid.path} begins with a rotation of {turns[0].tolist()} rad, but must begin with 0.")
     return times, _since_first(shifts), _since_first(turns)
@@ -222,12 +219,6 @@ def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None]
 
 def _since_first(rows: Any) -> Rows | None:
     return None if rows is None else np.array(rows, dtype=np.float64) - rows[0]
-
-
-def _stacked(found: Mapping[str, NDArray], names: Sequence[str], count: int) -> Rows | None:
-    if found.keys().isdisjoint(names):
-        return None
-    return np.stack([found.get(name, np.zeros(count)) for name in names], axis=1)
 
 
 def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
@@ -245,10 +236,7 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
             raise field_error((*path, given[0]), Words("given"), 'left out, as motion is "fixed"')
         return
     if solid.motion == "free":
-        _check_free(solid, given, path)
-        _check_inertia(solid, dimension, path)
-        _check_freedom(solid, dimension, path)
-        return
+        return _check_free(solid, given, dimension, path)
     if solid.path is not None:
         with usable_file((*path, "path"), solid.path, "the file of a path"):
             path_of(solid, dimension)
@@ -268,7 +256,7 @@ def check_motion(solid: Any, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, wrong[0]), Words("given"), f"left out, as {reason}")
 
 
-def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
+def _check_free(solid: Any, given: Sequence[str], dimension: int, path: FieldPath) -> None:
     if solid.mass is None and solid.density is None:
         raise field_error((*path, "density"), MISSING, 'a density in kg/m3, or a mass, as motion is "free"')
     if None not in (solid.mass, solid.density):
@@ -282,9 +270,14 @@ def _check_free(solid: Any, given: Sequence[str], path: FieldPath) -> None:
             raise field_error((*path, name), Words("given"), 'left out, as motion is "free"')
     if solid.side == "inside":
         raise field_error((*path, "side"), solid.side, '"outside", as motion is "free"')
-
-
-def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
+    if solid.freedom is not None:
+        ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
+        if not solid.freedom or len({*solid.freedom}) < len(solid.freedom) or not {*solid.freedom} <= {*ways}:
+            raise field_error((*path, "freedom"), found, f"some of {shown(list(ways))}, each once")
+        for name, own in (("velocity", ways[:dimension]), ("angular_velocity", ways[dimension:])):
+            for way, value in zip(own, getattr(solid, name) or (), strict=False):
+                if value != 0.0 and way not in solid.freedom:
+                    raise field_error((*path, name), getattr(solid, name), f"0 where the body is held, in {way!r}")
     numbers = solid.inertia
     if numbers is None:
         return
@@ -302,27 +295,15 @@ def _check_inertia(solid: Any, dimension: int, path: FieldPath) -> None:
         raise field_error((*path, "inertia"), numbers, wanted)
 
 
-def _check_freedom(solid: Any, dimension: int, path: FieldPath) -> None:
-    if solid.freedom is None:
-        return
-    ways, found = WAYS[dimension], Words(f"a list of {', '.join(map(repr, solid.freedom)) or 'nothing'}")
-    if not solid.freedom or len({*solid.freedom}) < len(solid.freedom) or not {*solid.freedom} <= {*ways}:
-        raise field_error((*path, "freedom"), found, f"some of {shown(list(ways))}, each once")
-    for name, own in (("velocity", ways[:dimension]), ("angular_velocity", ways[dimension:])):
-        for way, value in zip(own, getattr(solid, name) or (), strict=False):
-            if value != 0.0 and way not in solid.freedom:
-                raise field_error((*path, name), getattr(solid, name), f"0 where the body is held, in {way!r}")
-
-
 def _check_knots(solid: Any, dimension: int, path: FieldPath) -> None:
-    times: Sequence[float] = solid.times or ()
-    _check_times(path, times)
+    _check_times(path, solid.times)
     for name, size in (("positions", dimension), ("rotations", 2 * dimension - 3)):
         values = getattr(solid, name)
         if values is None:
             continue
-        if len(values) != len(times):
-            raise field_error((*path, name), Words(f"a list of {len(values)}"), f"a list of {len(times)}, as are times")
+        if len(values) != len(solid.times):
+            wanted = f"a list of {len(solid.times)}, as are times"
+            raise field_error((*path, name), Words(f"a list of {len(values)}"), wanted)
         for index, row in enumerate(values):
             if len(row) != size:
                 wanted = "one number in 2-D" if size == 1 else f"a list of {size} components"
@@ -343,11 +324,9 @@ def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
     """Check that the ``times`` of a table increase from 0 and that there is a value for each time. ``values`` is the
     key of the values. The table must not also have the key ``constant``."""
-    times: Sequence[float] = table.times or ()
-    given = getattr(table, values)
     _check_times(path, table.times)
-    if given is None or len(given) != len(times):
-        found = MISSING if given is None else Words(f"a list of {len(given)}")
-        raise field_error((*path, values), found, f"a list of {len(times)}, as are times")
+    given, wanted = getattr(table, values), f"a list of {len(table.times)}, as are times"
+    if given is None or len(given) != len(table.times):
+        raise field_error((*path, values), MISSING if given is None else Words(f"a list of {len(given)}"), wanted)
     if (alone := getattr(table, constant)) is not None:
         raise field_error((*path, constant), alone, f"left out, as there are {values}")

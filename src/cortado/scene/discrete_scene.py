@@ -16,9 +16,9 @@ from cortado.discretise.sheet import Sheet, sheet_points, sheet_weights
 from cortado.discretise.smoothing import SmoothingKernel, smoothing_kernel
 from cortado.discretise.solid import Placed
 from cortado.discretise.solid_walls import ContainerWalls, ExposedSurface, WallPoints, solid_places
-from cortado.discretise.walls import Places, RestLattice, WallLayers, wall_layers, wall_weights
+from cortado.discretise.walls import Places, RestLattice, WallLayers, wall_weights
 from cortado.errors import InputError, MassWarning, warn
-from cortado.scene.fluid_particles import FluidMasses, FluidSample, Surroundings, fluid_particles
+from cortado.scene.fluid_particles import FluidMasses, FluidSample, air_around, fluid_particles
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.motions import moving, wall_numbers
 from cortado.scene.scene import Scene
@@ -59,34 +59,34 @@ class Walls(Rows):
         return cls(points.positions, weights, points.feet, grips, 0.0 * points.feet, solid)
 
 
-def walls_of(scene: Scene, layers: WallLayers, lattice: RestLattice) -> Walls:
+def walls_of(scene: Scene, lattice: RestLattice) -> Walls:
     """Build the wall particles of a scene. Raise `InputError` for a solid without contact to fluid."""
-    even = _even_points(scene.container, scene.dimension, layers, lattice.spacing)
+    even = _even_points(scene.container, lattice)
     solids = scene.container.solids(scene.dimension, lattice.support)
     container = ContainerWalls(even, solids, scene.resting_room, lattice.spacing, lattice.support)
-    still = [_kept(scene, container, layers, lattice)]
+    still = [_kept(scene, container, lattice)]
     if container.room.solids:
-        still.append(_around(scene, container, still[0], layers, lattice))
+        still.append(_around(scene, container, still[0], lattice))
     periods, tables = scene.periods[1], moving(scene.solid)
     sheets = [table for table in scene.solid if table.is_sheet and not table.moves]
-    still += _beside_sheets(scene, sheets, container.room, still, layers, lattice)
+    still += _beside_sheets(scene, sheets, container.room, still, lattice)
     empty = Room(Region.everywhere(scene.dimension), (), 0.0 * periods)
     for k, table in enumerate(tables):
         if table.is_sheet:
-            still += _beside_sheets(scene, [table], empty, [], layers, lattice)
+            still += _beside_sheets(scene, [table], empty, [], lattice)
         else:
-            still.append(_alone(table, k, periods, layers, lattice))
+            still.append(_alone(table, k, periods, lattice))
     return Walls.joined(still)
 
 
-def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: RestLattice) -> Walls:
+def _kept(scene: Scene, container: ContainerWalls, lattice: RestLattice) -> Walls:
     from scipy.spatial import cKDTree
 
     points, dimension = container.points.some(container.stay), scene.dimension
     if not len(points):
         return Walls.of(points, points.flat, scene.container.sticks)
     short, folded = scene.container.shortened(lattice.spacing, lattice.support)
-    sought = _even_points(short, dimension, layers, lattice.spacing)
+    sought = _even_points(short, lattice)
     lower, lengths = short.periods(dimension)
     room = Room(short.region(dimension).opened(lengths), (), lengths)
     places = short.places(dimension, lattice.spacing, lattice.support)
@@ -95,15 +95,15 @@ def _kept(scene: Scene, container: ContainerWalls, layers: WallLayers, lattice: 
     return Walls.of(points, weights[same], scene.container.sticks)
 
 
-def _even_points(container: Container, dimension: int, layers: WallLayers, spacing: float) -> WallPoints:
-    particles = [container.walls(dimension, spacing, depth) for depth in layers.depths]
-    positions = np.concatenate(particles)
-    flat = np.repeat(layers.weights, [len(layer) for layer in particles])
+def _even_points(container: Container, lattice: RestLattice) -> WallPoints:
+    dimension, layers = lattice.dimension, lattice.layers
+    particles = [container.walls(dimension, lattice.spacing, depth) for depth in layers.depths]
+    positions, flat = np.concatenate(particles), np.repeat(layers.weights, [len(layer) for layer in particles])
     region = container.region(dimension).opened(container.periods(dimension)[1])
     return WallPoints(positions, flat, region.nearest(positions) - positions)
 
 
-def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLayers, lattice: RestLattice) -> Walls:
+def _around(scene: Scene, container: ContainerWalls, kept: Walls, lattice: RestLattice) -> Walls:
     """Build the wall particles of solids at rest and of the container near these solids."""
     room, (lower, _) = container.room, scene.periods
     resting = [solid for solid in thick(scene.solid) if not solid.moves]
@@ -117,25 +117,25 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, layers: WallLa
             raise InputError(f"solid {table.name!r} has no surface that fluid in the container can touch.")
     beside = scene.container.places(scene.dimension, lattice.spacing, lattice.support)
     beside = beside.some(container.is_near(beside.points, lattice.support))
-    points, weights = _weighed(surface, beside, kept, layers, lattice)
+    points, weights = _weighed(surface, beside, kept, lattice)
     owners, numbers = surface.owners(points), wall_numbers(scene.solid)
     found = Walls.of(points, weights, np.array([table.sticks for table in tables])[owners])
     of_tables = [-1 if isinstance(table, Container) else numbers[table.name] for table in tables]
     return replace(found, solid=np.array(of_tables)[owners])
 
 
-def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, lattice: RestLattice) -> Walls:
+def _alone(table: SolidTable, number: int, periods: Points, lattice: RestLattice) -> Walls:
     """Build the wall particles of a moving solid."""
     dimension, turn = len(periods), table.turn(len(periods))
     lower, upper = table.solid().extent()
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
     solid = Placed(table.own_solid(), np.zeros(dimension), turn) if filled.any() else table.own_solid()
     room, begins = Room(Region.everywhere(dimension), (solid,), filled), solid.extent()[0]
-    nothing = _even_points(NoContainer(), dimension, layers, lattice.spacing)
+    nothing = _even_points(NoContainer(), lattice)
     container = ContainerWalls(nothing, (), room, lattice.spacing, lattice.support)
     surface = ExposedSurface.of(container, room.images(solid), begins)
     beside, kept = Places.upright(nothing.positions), Walls.of(nothing, nothing.flat, False)
-    points, weights = _weighed(surface, beside, kept, layers, lattice)
+    points, weights = _weighed(surface, beside, kept, lattice)
     frame = np.eye(dimension) if filled.any() else turn
     placed = replace(points, positions=table.middle() + points.positions @ frame.T, feet=points.feet @ frame.T)
     found = Walls.of(placed, weights, table.sticks)
@@ -144,12 +144,7 @@ def _alone(table: SolidTable, number: int, periods: Points, layers: WallLayers, 
 
 
 def _beside_sheets(
-    scene: Scene,
-    tables: Sequence[SolidTable],
-    room: Room,
-    others: Sequence[Walls],
-    layers: WallLayers,
-    lattice: RestLattice,
+    scene: Scene, tables: Sequence[SolidTable], room: Room, others: Sequence[Walls], lattice: RestLattice
 ) -> list[Walls]:
     """Build the wall particles on both sides of sheets."""
     if not tables:
@@ -159,7 +154,7 @@ def _beside_sheets(
         about, middle, turn = table.own_solid(), table.middle(), table.turn(lattice.dimension)
         assert isinstance(about, Sheet)
         sheets.append(about.placed(middle, turn))
-        points = sheet_points(about, layers, lattice)
+        points = sheet_points(about, lattice)
         placed = replace(points, positions=middle + points.positions @ turn.T, feet=points.feet @ turn.T)
         walls = Walls.of(placed, points.flat, table.sticks)
         found.append(replace(walls, solid=np.full(len(points), numbers[table.name])))
@@ -170,12 +165,10 @@ def _beside_sheets(
     return [replace(own, weights=weights)]
 
 
-def _weighed(
-    surface: ExposedSurface, beside: Places, kept: Walls, layers: WallLayers, lattice: RestLattice
-) -> tuple[WallPoints, Points]:
+def _weighed(surface: ExposedSurface, beside: Places, kept: Walls, lattice: RestLattice) -> tuple[WallPoints, Points]:
     """Return the wall particles below a surface and their weights."""
     room, spacing, reach = surface.container.room, lattice.spacing, lattice.support
-    points = surface.walls(layers, lattice)
+    points = surface.walls(lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
     places = about.some(room.contains(about.points, -NEAREST_PLACE * spacing))
     walls, flat = np.concatenate([points.positions, kept.positions]), np.append(points.flat, kept.weights)
@@ -253,15 +246,11 @@ def discretise(scene: Scene) -> DiscreteScene:
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     at_rest = RestLattice(kernel, spacing, support, dimension)
-    layers = wall_layers(at_rest)
-    lattice = Lattice.of(kernel, spacing, support, dimension, scene.container.domain(dimension))
-    fluid = fluid_particles(scene)
-    walls = walls_of(scene, layers, at_rest)
+    lattice = Lattice.of(kernel, spacing, support, dimension, scene.domain)
+    fluid, walls = fluid_particles(scene), walls_of(scene, at_rest)
     own = wall_numbers(scene.solid)
     beside = ~np.isin(walls.solid, [own[table.name] for table in scene.solid if table.is_sheet])
-    # Packing would see the wall particles on both sides of a sheet.
-    fluid = _packed(fluid, walls.some(beside), at_rest, *scene.periods)
-    fluid = replace(fluid, positions=_off_sheets(scene, fluid))
+    fluid = _settled(scene, fluid, walls.some(beside), at_rest)  # packing would see the walls on both sides of a sheet
     masses = FluidMasses.of(scene, fluid)
     for sentence in (*thin_sentences(scene), *standing_sentences(scene)):
         warn(sentence)
@@ -277,29 +266,25 @@ def discretise(scene: Scene) -> DiscreteScene:
         told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, scene.periods, fluid.names)
         if told is not None:
             warn(told)
-    return DiscreteScene(kernel, lattice, fluid, masses, layers, walls, scene.periods[1])
+    return DiscreteScene(kernel, lattice, fluid, masses, at_rest.layers, walls, scene.periods[1])
 
 
-def _off_sheets(scene: Scene, fluid: FluidSample) -> Points:
-    """Return initial positions (n, d) [m] at least `OFF_SHEETS` spacings from sheets."""
-    found, least = fluid.positions.copy(), OFF_SHEETS * scene.discretisation.spacing
+def _settled(scene: Scene, fluid: FluidSample, walls: Walls, lattice: RestLattice) -> FluidSample:
+    """Return the fluid after packing, at least `OFF_SHEETS` spacings from sheets."""
+    if fluid.bodies:
+        stays, (lower, lengths) = ~fluid.is_packed, scene.periods
+        air, shares = air_around(fluid.bodies, fluid.positions[stays], lower, lengths, lattice.support)
+        fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
+        moved, kept = Packing(lattice, fixed, weights, len(air), lengths).packed(fluid.positions, stays)
+        fluid = replace(fluid.some(kept), positions=moved)
+    found, least = fluid.positions.copy(), OFF_SHEETS * lattice.spacing
     for table in scene.solid:
         about = table.own_solid()
         if isinstance(about, Sheet):
             sheet = about.placed(table.middle(), table.turn(scene.dimension))
             near = np.flatnonzero(~fluid.is_placed & (sheet.distance(found) < least))
             found[near] = sheet.aside(found[near], least)
-    return found
-
-
-def _packed(fluid: FluidSample, walls: Walls, lattice: RestLattice, lower: Points, lengths: Points) -> FluidSample:
-    if not fluid.bodies:
-        return fluid
-    stays = ~fluid.is_packed
-    air, shares = Surroundings(fluid.bodies, fluid.positions[stays], lower, lengths).air(lattice.support)
-    fixed, weights = np.concatenate([air, walls.positions]), np.append(shares, walls.weights)
-    found, kept = Packing(lattice, fixed, weights, len(air), lengths).packed(fluid.positions, stays)
-    return replace(fluid.some(kept), positions=found)
+    return replace(fluid, positions=found)
 
 
 def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:

@@ -4,22 +4,22 @@ from math import inf
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from cortado.discretise.room import Room
-from cortado.discretise.shapes import Points
+from cortado.discretise.shapes import Points, grid
 from cortado.errors import Words
 from cortado.scene.courses import Knots, check_over_time, lists_in_file
 from cortado.scene.parameters import Axis, Parameter, Range, Source, ending, of_part, spacing_of
-from cortado.scene.shape_tables import File, check_order
-from cortado.scene.tables import MISSING, FieldPath, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.shape_tables import File, Ordered
+from cortado.scene.tables import MISSING, Direction, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 PRESCRIBED, BLENDED = 3.0, 3.0
 """Thicknesses of the two shells around a sink: the inner shell has a prescribed flow, the outer shell a transition
 [spacings]."""
 
 
-class BoxDrain(Table):
+class BoxDrain(Ordered):
     """A box that removes every particle inside."""
 
     shape: Literal["box"]
@@ -34,12 +34,6 @@ class BoxDrain(Table):
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("lower", "upper"), dimension, path)
         return super().in_dimension(dimension, path)
-
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        if self.lower is not None and self.upper is not None and len(self.lower) == len(self.upper):
-            check_order(self.lower, self.upper)
-        return self
 
     def ends(self, dimension: int) -> Points:
         """Return the lower and the upper corner (2, d) [m]. A coordinate is infinite if the box has no end there."""
@@ -61,14 +55,8 @@ class PlaneDrain(Table):
     """Name of the drain."""
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
-    direction: Vector[Annotated[float, quantity()]]
+    direction: Direction
     """(d,) Direction in which particles cross the plane; its length has no effect."""
-
-    @model_validator(mode="after")
-    def _check_direction(self) -> Self:
-        if not any(self.direction):
-            raise field_error(("direction",), self.direction, "a vector that is not zero")
-        return self
 
     def middle(self, dimension: int) -> Points:
         return np.array(self.position)
@@ -114,29 +102,30 @@ class FlowTable(Table):
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
+    def _flows(self) -> tuple[float, ...]:
+        return self.flow_rates or (self.flow_rate or 0.0,)
+
+    @property
     def begun(self) -> float:
         """Flow rate at the start [m3/s (m2/s in 2-D)]."""
-        return (self.flow_rates or (self.flow_rate or 0.0,))[0]
+        return self._flows[0]
 
     @property
     def greatest(self) -> float:
         """Greatest flow rate [m3/s (m2/s in 2-D)]."""
-        return max(self.flow_rates or (self.flow_rate or 0.0,))
-
-    def _at(self, times: Points) -> Points:
-        return np.full(len(times), self.begun) if self.course is None else self.course.at(times)
+        return max(self._flows)
 
     def passed(self, time: float) -> float:
         """Return the volume [m3], in 2-D the area [m2], of the fluid that has flowed until ``time`` [s]."""
         times = np.append(np.clip(self.times or 0.0, 0.0, time), time)
-        return float(np.trapezoid(self._at(times), times))
+        return float(np.trapezoid(np.interp(times, self.times or (0.0,), self._flows), times))
 
     def time_for(self, volume: float) -> float:
         """Return the time [s] at which a volume (in 2-D an area) of fluid has flowed. Return infinity if it
         never does."""
         last = float((self.times or (0.0,))[-1])
         times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
-        flows = self._at(times)
+        flows = np.interp(times, self.times or (0.0,), self._flows)
         volumes = np.concatenate([[0.0], np.cumsum(0.5 * (flows[1:] + flows[:-1]) * np.diff(times))])
         if volume > volumes[-1]:
             return last + float((volume - volumes[-1]) / flows[-1]) if flows[-1] > 0.0 else inf
@@ -194,35 +183,30 @@ def check_drains(scene: Any) -> None:
             if inner < spacing:
                 raise field_error((*path, "radius"), drain.radius, f"at least one spacing, {spacing:g} m")
             if open_sphere(room, place, inner + PRESCRIBED * spacing) == 0.0:
-                raise field_error(
-                    (*path, "radius"), inner, "so small that fluid is around it, three spacings further out"
-                )
+                wanted = "so small that fluid is around it, three spacings further out"
+                raise field_error((*path, "radius"), inner, wanted)
         elif ends is not None:
-            _check_reached(drain, np.array(ends), path)
-            if isinstance(drain, BoxDrain) and not _is_open(scene, drain, np.array(ends)):
-                raise field_error(path, Words("all of it in solids"), "where a part of it is outside of them")
+            _check_reached(scene, drain, np.array(ends), path)
 
 
-def _is_open(scene: Any, drain: BoxDrain, ends: Points) -> bool:
-    lower, upper = np.clip(drain.ends(scene.dimension), *ends)
-    most = 512 if scene.dimension == 2 else 64
-    cells = np.clip(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1, most).astype(int)
-    parts = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(lower, upper, cells, strict=True)]
-    points = np.stack(np.meshgrid(*parts, indexing="ij"), axis=-1).reshape(-1, scene.dimension)
-    return bool(scene.resting_room.contains(points, 0.0).any())
-
-
-def _check_reached(drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) -> None:
-    found: tuple[float, ...] | None
+def _check_reached(scene: Any, drain: BoxDrain | PlaneDrain, ends: Points, path: FieldPath) -> None:
+    wanted = "where a part of the drain is in the container"
     if isinstance(drain, PlaneDrain):
-        key, found, way = "position", drain.position, np.array(drain.direction)
-        reached = (np.where(way > 0.0, ends[1], ends[0]) - drain.position) @ way > 0.0
-    else:
-        lower, upper = drain.ends(ends.shape[1])
-        reached = ((lower < ends[1]) & (upper > ends[0])).all()
-        key, found = ("lower", drain.lower) if (lower >= ends[1]).any() else ("upper", drain.upper)
-    if not reached:
-        raise field_error((*path, key), found, "where a part of the drain is in the container")
+        way = np.array(drain.direction)
+        if (np.where(way > 0.0, ends[1], ends[0]) - drain.position) @ way <= 0.0:
+            raise field_error((*path, "position"), drain.position, wanted)
+        return
+    lower, upper = drain.ends(scene.dimension)
+    if (lower >= ends[1]).any():
+        raise field_error((*path, "lower"), drain.lower, wanted)
+    if (upper <= ends[0]).any():
+        raise field_error((*path, "upper"), drain.upper, wanted)
+    lower, upper = np.clip([lower, upper], *ends)
+    most = 512 if scene.dimension == 2 else 64
+    cells = np.clip(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1, most)
+    parts = [low + (high - low) * (np.arange(n) + 0.5) / n for low, high, n in zip(lower, upper, cells, strict=True)]
+    if not scene.resting_room.contains(grid(parts), 0.0).any():
+        raise field_error(path, Words("all of it in solids"), "where a part of it is outside of them")
 
 
 def sink_limit(scene: Any, values: Any) -> float:

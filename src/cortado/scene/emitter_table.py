@@ -16,7 +16,7 @@ from cortado.scene.drain_tables import FlowTable
 from cortado.scene.fluids import FluidBody
 from cortado.scene.motions import course_table
 from cortado.scene.parameters import Axis, Parameter, ending, of_part, spacing_of
-from cortado.scene.tables import GREATEST, MISSING, FieldPath, Length, Text, Vector, field_error, quantity
+from cortado.scene.tables import MISSING, Direction, FieldPath, Length, Text, Vector, field_error, quantity
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,6 @@ class EmitterSample:
 OF_OPENINGS = ("emitted", "again", "drained", ".count")
 COLUMN = 6.0
 """Default length of the column of fluid behind the opening [spacings]."""
-
-
 path_name = ending("path")
 """Parameter: position of an emitter's opening over time [m]."""
 outlet_name = ending("outlet")
@@ -86,7 +84,7 @@ class EmitterTable(FluidBody, FlowTable):
     """Name of the emitter. The names of the emitter's parameters begin with it."""
     outlet: Vector[Length]
     """(d,) Middle of the opening [m]."""
-    direction: Vector[Annotated[float, quantity()]] = (0.0, -1.0, 0.0)
+    direction: Direction = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length has no effect."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Radius of a round opening, in 2-D half its width [m]. Fluid passes through the lattice cells inside the opening,
@@ -113,8 +111,6 @@ class EmitterTable(FluidBody, FlowTable):
     @classmethod
     def _normalise(cls, direction: tuple[float, ...]) -> tuple[float, ...]:
         size = math.hypot(*direction)
-        if size < 1.0 / GREATEST:
-            raise field_error((), direction, "a vector that is not zero")
         return direction if abs(size - 1.0) < 1e-12 else tuple(value / size for value in direction)
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
@@ -181,15 +177,10 @@ class EmitterTable(FluidBody, FlowTable):
         upstream = np.repeat((np.arange(layers) + 0.5) * spacing, len(cross_section))
         moves = np.random.default_rng(0).uniform(-self.jitter, self.jitter, (len(upstream), len(self.outlet) - 1))
         offsets = np.tile(cross_section, (layers, 1)) + spacing * moves @ across(self.direction)
-        return EmitterSample(
-            offsets=offsets,
-            upstream=upstream,
-            positions=np.array(self.outlet) + offsets - np.outer(upstream, self.direction),
-            velocities=np.tile(speed * np.array(self.direction), (len(upstream), 1)),
-            speed=speed,
-            layer=len(cross_section),
-            column=self.layers(spacing) * spacing,
-        )
+        positions = np.array(self.outlet) + offsets - np.outer(upstream, self.direction)
+        velocities = np.tile(speed * np.array(self.direction), (len(upstream), 1))
+        column, layer = self.layers(spacing) * spacing, len(cross_section)
+        return EmitterSample(offsets, upstream, positions, velocities, speed, layer, column)
 
     def count(self, spacing: float) -> float:
         return float(np.prod(self._cells(spacing))) * self.supply(spacing)
@@ -219,9 +210,9 @@ class EmitterTable(FluidBody, FlowTable):
 def emitter_parameters(scene: Any) -> list[Parameter]:
     found = []
     for emitter in scene.emitter:
-        name, course = path_name(emitter.name), None if emitter.path is None else emitter.path.knots
-        found += [_path_of(name, f"the emitter {emitter.name}", emitter.outlet, course)]
-        found += [emitter.flow_parameter(scene.dimension)]
+        course = None if emitter.path is None else emitter.path.knots
+        outlet = _path_of(path_name(emitter.name), f"the emitter {emitter.name}", emitter.outlet, course)
+        found += [outlet, emitter.flow_parameter(scene.dimension)]
     return found
 
 
@@ -256,8 +247,7 @@ def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
     fluid particles in the scene."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
-    names = [emitter.name for emitter in scene.emitter]
-    return list(zip(names, ends[:-1].tolist(), made, strict=True))
+    return list(zip([emitter.name for emitter in scene.emitter], ends[:-1].tolist(), made, strict=True))
 
 
 def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:

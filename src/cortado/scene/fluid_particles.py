@@ -7,7 +7,7 @@ particles are then packed (`cortado.discretise.packing`).
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self, TypeGuard
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from cortado.discretise.room import Region, Room
 from cortado.discretise.shapes import EXCESS, Points, Which, apart, grid, pairs_within
 from cortado.errors import InputError
 from cortado.scene.emitter_table import EmitterSample, samples
-from cortado.scene.fluids import ALIGNED, Fluid, PointsFluid, RegionFluid
+from cortado.scene.fluids import ALIGNED, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 
 FINER = 4
@@ -29,14 +29,6 @@ FAR = 4.0
 """Greatest depth below the surface that is computed [spacings]."""
 DIGITS = 6
 """Number of decimals of depths [spacings] when particles are sorted by depth."""
-
-
-def is_packed(fluid: Fluid, room: Room, reach: float, spacing: float) -> TypeGuard[RegionFluid]:
-    """Test if the particles of a body are packed. This is so if its surface cuts lattice cells, or if a solid is within
-    ``reach`` [m]."""
-    if not isinstance(fluid, RegionFluid) or fluid.cuts_cells(spacing):
-        return isinstance(fluid, RegionFluid)
-    return bool(len(room.solids) and (room.from_solids(fluid.particles(spacing), reach) < reach).any())
 
 
 @dataclass(frozen=True)
@@ -86,8 +78,10 @@ class CutBody:
 
     def particles(self) -> Points:
         """Return initial positions on the lattice (n, d) [m]."""
-        if not self._cuts_cells():
-            return self.fluid.particles_in(self.room, self.spacing)
+        if not self.fluid.cuts_cells(self.spacing):
+            from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
+            if (np.abs(from_solids) >= (0.5 - ALIGNED) * self.fluid.block(self.spacing).spacings.min()).all():
+                return self.fluid.particles_in(self.room, self.spacing)
         points = self.fluid.lattice(self.spacing, self.spacing)
         depths = np.round(self.distance(points, FAR * self.spacing) / self.spacing, DIGITS)
         depths = np.where(self._beside_cuts(points), depths, np.copysign(np.inf, depths))
@@ -105,53 +99,37 @@ class CutBody:
         cells = lattice.grown(1).points()
         return cKDTree(cells[np.abs(self.distance(cells, self.spacing)) < (0.5 - ALIGNED) * lattice.spacings.min()])
 
-    def _cuts_cells(self) -> bool:
-        if self.fluid.cuts_cells(self.spacing):
-            return True
-        from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
-        return bool((np.abs(from_solids) < (0.5 - ALIGNED) * self.fluid.block(self.spacing).spacings.min()).any())
 
+def air_around(
+    bodies: tuple[CutBody, ...], staying: Points, lower: Points, lengths: Points, reach: float
+) -> tuple[Points, Points]:
+    """Return lattice points in the air, within ``reach`` [m] of the surfaces of bodies (m, d) [m]. Also return the
+    fraction of air in the lattice cell around each point (m,).
 
-@dataclass(frozen=True)
-class Surroundings:
-    bodies: tuple[CutBody, ...]
-    staying: Points
-    """Positions of the particles that packing does not move (m, d) [m]."""
-    lower: Points
-    """Lower corner of the periodic box (d,) [m]."""
-    lengths: Points
-    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
-
-    def air(self, reach: float) -> tuple[Points, Points]:
-        """Return lattice points in the air, within ``reach`` [m] of the surfaces of bodies (m, d) [m]. Also return the
-        fraction of air in the lattice cell around each point (m,)."""
-        found = [self._air_around(body, reach) for body in self.bodies]
-        points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return points[shares > 0.0], shares[shares > 0.0]
-
-    def _air_around(self, body: CutBody, reach: float) -> tuple[Points, Points]:
-        """Return the air around one body of fluid."""
-        points = body.fluid.lattice(body.spacing, reach + body.spacing)
-        middle = 0.5 * np.sum(body.fluid.extent(body.spacing), axis=0)
-        within = ((self.lengths == 0.0) | (np.abs(points - middle) < 0.5 * self.lengths)).all(axis=1)
-        furthest = reach + body.spacing
+    ``staying`` (k, d) [m] are the particles that packing does not move. ``lower`` and ``lengths`` (d,) [m] are the
+    lower corner and the lengths of the periodic box; a length is 0 along an axis that is not periodic.
+    """
+    found = []
+    for number, body in enumerate(bodies):
+        spacing, furthest = body.spacing, reach + body.spacing
+        points = body.fluid.lattice(spacing, furthest)
+        middle = 0.5 * np.sum(body.fluid.extent(spacing), axis=0)
+        within = ((lengths == 0.0) | (np.abs(points - middle) < 0.5 * lengths)).all(axis=1)
         points = points[within & (np.abs(body.distance(points, furthest)) < furthest)]
-        nearest = np.argmin([self._distance(other, points, furthest) for other in self.bodies], axis=0)
-        points = points[nearest == self.bodies.index(body)]
-        fluid = self._shares(points, body.spacing)
-        walls = np.clip(0.5 + body.room.distance(points, body.spacing) / body.spacing, 0.0, 1.0)
-        return points, np.clip(1.0 - fluid - walls, 0.0, 1.0)
-
-    def _distance(self, body: CutBody, points: Points, reach: float) -> Points:
-        return np.min([body.distance(points + shift, reach) for shift in body.room.shifts()], axis=0)
-
-    def _shares(self, points: Points, spacing: float) -> Points:
-        found = sum(body.shares(points + shift) for body in self.bodies for shift in body.room.shifts())
-        reach = spacing * np.sqrt(points.shape[1])
-        point, particle, _ = pairs_within(points, self.staying, reach, self.lower, self.lengths)
-        separations = np.abs(apart(points[point] - self.staying[particle], self.lengths))
+        distances = [
+            np.min([other.distance(points + shift, furthest) for shift in other.room.shifts()], axis=0)
+            for other in bodies
+        ]
+        points = points[np.argmin(distances, axis=0) == number]
+        fluid: Any = sum(other.shares(points + shift) for other in bodies for shift in other.room.shifts())
+        point, particle, _ = pairs_within(points, staying, spacing * np.sqrt(points.shape[1]), lower, lengths)
+        separations = np.abs(apart(points[point] - staying[particle], lengths))
         common = np.clip(1.0 - separations / spacing, 0.0, None).prod(axis=1)
-        return np.asarray(found + np.bincount(point, common, minlength=len(points)), dtype=np.float64)
+        fluid += np.bincount(point, common, minlength=len(points))
+        walls = np.clip(0.5 + body.room.distance(points, spacing) / spacing, 0.0, 1.0)
+        found.append((points, np.clip(1.0 - fluid - walls, 0.0, 1.0)))
+    points, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points[shares > 0.0], shares[shares > 0.0]
 
 
 @dataclass(frozen=True)
@@ -206,10 +184,18 @@ def fluid_particles(scene: Scene) -> FluidSample:
     room, reach = scene.room, scene.discretisation.support_radius
     bodies, positions, velocities, asked = list[CutBody | None](), list[Points](), list[Points](), list[float]()
     for index, fluid in enumerate(scene.fluid):
-        body = CutBody(fluid, room, spacing) if is_packed(fluid, room, reach, spacing) else None
+        body = CutBody(fluid, room, spacing) if isinstance(fluid, RegionFluid) else None
+        if body is not None and not body.fluid.cuts_cells(spacing):  # it is packed only beside solids
+            is_near = room.solids and (room.from_solids(fluid.particles(spacing), reach) < reach).any()
+            body = body if is_near else None
         particles = fluid.particles_in(room, spacing) if body is None else body.particles()
         if not len(particles):
-            raise InputError(f"fluid.{index} has no particle{_why_none(body, spacing)}.")
+            why = f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls"
+            if body is not None:
+                cells = body.volume() / spacing**scene.dimension
+                why = f", as the volume that walls leave it is {cells:.2g} of that of a particle"
+            larger = "it must be larger, or further from them" if body is None else "it must be larger"
+            raise InputError(f"fluid.{index} has no particle{why}: {larger}.")
         bodies.append(body)
         positions.append(particles)
         velocities.append(fluid.velocities(particles))
@@ -257,16 +243,6 @@ def resting_places(scene: Scene, count: int) -> Points:
     number = np.stack(np.unravel_index(np.arange(count), slots.astype(int)), axis=1)
     start = upper + 2.0 * (float((upper - lower).max()) + support)
     return np.where(free, start + pitch * number, begin + pitch * (number + 0.5))
-
-
-def _why_none(body: CutBody | None, spacing: float) -> str:
-    if body is None:
-        return (
-            f" that is half a spacing, {0.5 * spacing:g} m, or more from all walls: it must be larger, or further "
-            "from them"
-        )
-    cells = body.volume() / spacing**body.room.dimension
-    return f", as the volume that walls leave it is {cells:.2g} of that of a particle: it must be larger"
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,18 @@
 
 from abc import abstractmethod
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from cortado.discretise.primitives import block_around, points_inside
 from cortado.discretise.room import Region, Room
-from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, corners, grid
-from cortado.discretise.solid import Placed, Solid
+from cortado.discretise.shapes import ROUND_OFF, Block, Points, block_about, block_filling, grid
+from cortado.discretise.solid import Placed, Solid, rotation_matrix
 from cortado.scene.point_files import read_points
 from cortado.scene.shape_tables import BoxShape, CylinderShape, File, MeshShape, PolygonShape, SphereShape
-from cortado.scene.tables import FieldPath, Length, Rotation, Table, Text, Turning, Vector, quantity, rotation_matrix
+from cortado.scene.tables import Angle, Length, OnAxes, Table, Text, Turns, Vector, quantity
 
 ALIGNED = 1e-3
 """Tolerance for a surface along faces of lattice cells [spacings]."""
@@ -43,13 +43,9 @@ class Fluid(FluidBody):
 
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) Velocity at the start [m/s]."""
-    angular_velocity: Turning | None = None
+    angular_velocity: Turns[Annotated[float, quantity("rad/s")]] = None
     """Initial angular velocity about the middle of the body [rad/s]; no rotation if left out. In 3-D a vector, in 2-D
     one number, counterclockwise."""
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        self._check_turns(("angular_velocity",), dimension, path)
-        return super().in_dimension(dimension, path)
 
     def velocities(self, points: Points) -> Points:
         """Return initial velocities (n, d) [m/s] of particles at positions (n, d) [m]."""
@@ -65,10 +61,6 @@ class Fluid(FluidBody):
         spin = np.linalg.norm(self.angular_velocity or 0.0)
         lower, upper = self.extent(spacing) if spin else (np.zeros(1), np.zeros(1))
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
-
-    def witnesses(self, spacing: float) -> Points:
-        """Return points (n, d) [m] with a convex hull that contains all particles."""
-        return self.particles(spacing)
 
     def particles_in(self, room: Room, spacing: float) -> Points:
         """Return the positions of the particles in ``room`` (n, d) [m]."""
@@ -124,13 +116,9 @@ class RegionFluid(Fluid):
 class Turnable(RegionFluid):
     """A body of fluid that may be rotated. The particles of a rotated body are packed."""
 
-    rotation: Rotation | None = None
+    rotation: Turns[Angle] = None
     """Rotation about the middle of the body [rad]; no rotation if left out. In 3-D a rotation vector, in 2-D one
     number, counterclockwise."""
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        self._check_turns(("rotation",), dimension, path)
-        return super().in_dimension(dimension, path)
 
 
 class BoxFluid(BoxShape, Turnable):
@@ -154,9 +142,6 @@ class BoxFluid(BoxShape, Turnable):
         lattice = self.block(spacing)
         (first, last), half = lattice.extent, 0.5 * lattice.spacings
         return Region.between(first - half, last + half).distance(points)
-
-    def witnesses(self, spacing: float) -> Points:
-        return corners(*self.extent(spacing))
 
 
 class RoundFluid(RegionFluid):
@@ -183,22 +168,18 @@ class SphereFluid(SphereShape, RoundFluid):
 class CylinderFluid(CylinderShape, Turnable, RoundFluid):
     """A cylinder of fluid, in 3-D."""
 
-    instead: ClassVar = '"box", "sphere" or "points"'
+    _instead: ClassVar = {2: '"box", "sphere" or "points"'}
 
     def block(self, spacing: float) -> Block:
-        axis = self.along
-        base, half = np.array(self.base), np.full(3, self.radius)
-        half[axis] = 0.5 * self.height
-        block = block_about(base, half, spacing)
-        standing = np.where(np.arange(3) == axis, base + 0.5 * spacing, block.first)
-        return Block(standing, block.counts, block.spacings)
+        base, along = np.array(self.base), np.arange(3) == self.along
+        block = block_about(base, np.where(along, 0.5 * self.height, self.radius), spacing)
+        return replace(block, first=np.where(along, base + 0.5 * spacing, block.first))
 
     def volume(self, spacing: float) -> float:
         return float(np.pi * self.radius**2 * self.height)
 
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        axis = self.along
-        return Region.cylinder(np.array(self.base), self.radius, self.height, axis).distance(points)
+        return Region.cylinder(np.array(self.base), self.radius, self.height, self.along).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
         """Return a lattice with layers that fill the height of the cylinder."""
@@ -254,9 +235,6 @@ class Filled(Turnable):
     def particles(self, spacing: float) -> Points:
         return points_inside(self.body(), spacing)
 
-    def witnesses(self, spacing: float) -> Points:
-        return self.particles(spacing)
-
     def lattice(self, spacing: float, reach: float) -> Points:
         return RegionFluid.lattice(self, spacing, reach)
 
@@ -268,16 +246,12 @@ class Filled(Turnable):
 class FilledShape(Filled):
     """A body of fluid with a shape and an optional position."""
 
-    position: tuple[Length, ...] | None = None
+    position: OnAxes[Length] = None
     """(d,) Position of the centroid [m]; if left out, the shape's corners or mesh determine it."""
 
     def body(self) -> Placed:
         placed = super().body()
         return placed if self.position is None else replace(placed, position=np.array(self.position))
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        self.check_components(("position",), dimension, path)
-        return super().in_dimension(dimension, path)
 
 
 class TurnedBox(Filled, BoxFluid):

@@ -18,7 +18,7 @@ from cortado.scene.motions import mass_of_one, weight_name
 from cortado.scene.parameter_values import Arrays
 from cortado.scene.parameters import Axis, Parameter, Range, Source, of_part
 from cortado.scene.shape_tables import File
-from cortado.scene.solids import SolidTable, check_free_body
+from cortado.scene.solids import SolidTable
 from cortado.scene.tables import FieldPath, Flag, Length, Table, Text, Vector, check_name, field_error, quantity
 
 Three = tuple[float, float, float]
@@ -135,14 +135,28 @@ def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
     return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
 
+def check_free_body(path: FieldPath, name: str, tables: Sequence[SolidTable]) -> None:
+    free = [table.name for table in tables if table.motion == "free"]
+    check_name(path, name, free, "a free body", 'of a solid whose motion is "free"')
+
+
 def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:
     """Check the hinges of a scene. Hinges must belong to free bodies and must not form closed chains."""
-    joined = {solid.name: {solid.name} for solid in solids}
+    joined = {solid.name: {solid.name} for solid in solids}  # the solids that hinges join to each
     for index, hinge in enumerate(hinges):
         path = ("hinge", index)
         check_free_body((*path, "solid"), hinge.solid, solids)
         if hinge.to is not None:
-            _check_joint(hinge, solids, joined, path)
+            others = [solid.name for solid in solids if solid.moves and solid.name != hinge.solid]
+            check_name((*path, "to"), hinge.to, others, "another solid that moves", "left out, for the world")
+            for number, solid in enumerate(solids):
+                if solid.name in (hinge.solid, hinge.to) and solid.motion == "free" and solid.sticks:
+                    wanted = f'"free", as the body is on the hinge {hinge.name!r} to another solid'
+                    raise field_error(("solid", number, "slip"), solid.slip, wanted)
+            if hinge.to in joined[hinge.solid]:
+                raise field_error((*path, "to"), hinge.to, "a solid that other hinges do not join to this one already")
+            whole = joined[hinge.solid] | joined[hinge.to]
+            joined |= dict.fromkeys(whole, whole)
             continue
         if hinge.solid in [other.solid for other in hinges[:index] if other.to is None]:
             raise field_error((*path, "solid"), hinge.solid, "another one, as this one is on a hinge already")
@@ -156,44 +170,6 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
             if np.abs(across).max() > 1e-9 * np.abs(solid.angular_velocity).max():
                 wanted = f"along the axis of the hinge {hinge.name!r}, {shown(hinge.axis)}"
                 raise field_error(("solid", number, "angular_velocity"), solid.angular_velocity, wanted)
-
-
-def _check_joint(hinge: HingeTable, solids: Sequence[SolidTable], joined: dict[str, set[str]], path: FieldPath) -> None:
-    """Check a hinge between two solids. ``joined`` maps each solid to its connected solids and is updated."""
-    assert hinge.to is not None
-    ends = [hinge.solid, hinge.to]
-    others = [solid.name for solid in solids if solid.moves and solid.name != hinge.solid]
-    check_name((*path, "to"), hinge.to, others, "another solid that moves", "left out, for the world")
-    for number, solid in enumerate(solids):
-        if solid.name in ends and solid.motion == "free" and solid.sticks:
-            wanted = f'"free", as the body is on the hinge {hinge.name!r} to another solid'
-            raise field_error(("solid", number, "slip"), solid.slip, wanted)
-    if hinge.to in joined[hinge.solid]:
-        raise field_error((*path, "to"), hinge.to, "a solid that other hinges do not join to this one already")
-    whole = joined[hinge.solid] | joined[hinge.to]
-    joined |= dict.fromkeys(whole, whole)
-
-
-def hinge_parameters(hinge: HingeTable, dimension: int) -> list[Parameter]:
-    turn, of, found = "N m" if dimension == 3 else "N", (hinge.name, f"of the hinge {hinge.name}"), list[Parameter]()
-    if hinge.to is not None:
-        where = f"where in its solids the hinge {hinge.name} is, as they are in the scene"
-        tenth: Any = {"change": lambda source, value: np.full(np.shape(value), 0.1)}
-        found.append(of_part(f"{hinge.name}.position", "m", where, hinge.position, **tenth))
-    if hinge.turned_by:
-        not_negative = Range.NOT_NEGATIVE
-        found += [
-            number_of(*of, "stiffness", f"{turn}/rad", "the stiffness", hinge.stiffness or 0.0, not_negative, 1.0),
-            number_of(*of, "rest_angle", "rad", "the angle at rest", hinge.rest_angle, Range.ANY, 1.0),
-            number_of(*of, "damping", f"{turn} s/rad", "the damping", hinge.damping or 0.0, not_negative, 1.0),
-        ]
-        for name, units in (("torque", turn), ("speed", "rad/s")):
-            course, steady = hinge.course(name), getattr(hinge, name) or 0.0
-            values = np.ravel(steady if course is None else course.values)
-            size, what = float(np.abs(values).max()) or 1.0, f"the motor's {name} in each step"
-            number = number_of(*of, name, units, what, float(values[0]), Range.ANY, size)
-            found.append(replace(number, axis=Axis.STEP, course=course))
-    return found
 
 
 def number_of(
@@ -334,7 +310,7 @@ def check_springs(springs: Sequence[SpringTable], hinges: Sequence[HingeTable], 
 
 
 def spring_parameters(scene: Any) -> list[Parameter]:
-    pull = "N/m" if scene.dimension == 3 else "N/m²"
+    pull, turn = ("N/m", "N m") if scene.dimension == 3 else ("N/m²", "N")
     positive, not_negative, found = Range.POSITIVE, Range.NOT_NEGATIVE, list[Parameter]()
     for spring in scene.spring:
         of, k = (spring.name, f"of the spring {spring.name}"), spring.stiffness
@@ -344,21 +320,25 @@ def spring_parameters(scene: Any) -> list[Parameter]:
             number_of(*of, "damping", f"{pull} s", "the damping", spring.damping, not_negative, 0.1 * k),
         ]
     for hinge in scene.hinge:
-        found += hinge_parameters(hinge, scene.dimension)
+        of = (hinge.name, f"of the hinge {hinge.name}")
+        if hinge.to is not None:
+            where = f"where in its solids the hinge {hinge.name} is, as they are in the scene"
+            tenth: Any = {"change": lambda source, value: np.full(np.shape(value), 0.1)}
+            found.append(of_part(f"{hinge.name}.position", "m", where, hinge.position, **tenth))
+        if not hinge.turned_by:
+            continue
+        found += [
+            number_of(*of, "stiffness", f"{turn}/rad", "the stiffness", hinge.stiffness or 0.0, not_negative, 1.0),
+            number_of(*of, "rest_angle", "rad", "the angle at rest", hinge.rest_angle, Range.ANY, 1.0),
+            number_of(*of, "damping", f"{turn} s/rad", "the damping", hinge.damping or 0.0, not_negative, 1.0),
+        ]
+        for name, units in (("torque", turn), ("speed", "rad/s")):
+            course, steady = hinge.course(name), getattr(hinge, name) or 0.0
+            values = np.ravel(steady if course is None else course.values)
+            size, what = float(np.abs(values).max()) or 1.0, f"the motor's {name} in each step"
+            number = number_of(*of, name, units, what, float(values[0]), Range.ANY, size)
+            found.append(replace(number, axis=Axis.STEP, course=course))
     return found
-
-
-@dataclass(frozen=True)
-class _Yielding:
-    table: SolidTable
-    mass: float
-    lightest: float
-    """Greatest eigenvalue of the inverse inertia [1/(kg m2)]."""
-
-    def at(self, point: Any) -> float:
-        """Return an upper bound on the inverse effective mass at a point (d,) of the body [1/kg]."""
-        arm = np.subtract(point, self.table.middle())
-        return float(1.0 / self.mass + self.lightest * (arm @ arm))
 
 
 def spring_limit(scene: Any, values: Arrays) -> float:
@@ -368,32 +348,29 @@ def spring_limit(scene: Any, values: Arrays) -> float:
         if table.motion == "free":
             one, weight = mass_of_one(table), float(values.get(weight_name(table), table.mass or table.density))
             inertia = inertia_about(Hold.of(table, scene.dimension, scene.hinge), one)
-            lightest = np.linalg.eigvalsh(np.linalg.pinv(weight * inertia)).max()
-            bodies[table.name] = _Yielding(table, weight * one.volume, float(lightest))
-    ends: list[tuple[str, list[tuple[str, float]]]] = []
+            lightest = float(np.linalg.eigvalsh(np.linalg.pinv(weight * inertia)).max())
+            bodies[table.name] = table.middle(), 1.0 / (weight * one.volume), lightest
+    links: list[tuple[Any, list[tuple[str, float]]]] = []  # with 1 / mass or 1 / inertia of the body at each end
     for spring in scene.spring:
-        both = ((spring.solid, spring.point), (spring.to, spring.anchor))
-        ends.append((spring.name, [(name, bodies[name].at(place)) for name, place in both if name in bodies]))
-    for hinge in scene.hinge:
-        if hinge.turned_by:
-            on = [name for name in (hinge.solid, hinge.to) if name in bodies]
-            ends.append((hinge.name, [(str(name), bodies[str(name)].lightest) for name in on]))
-    known = dict(values)
-    for one in (*scene.spring, *scene.hinge):
-        for end in ("stiffness", "damping"):
-            known.setdefault(f"{one.name}.{end}", np.array(getattr(one, end) or 0.0))
-    square, rate = (_greatest(ends, known, end) for end in ("stiffness", "damping"))
+        ends = []
+        for name, point in ((spring.solid, spring.point), (spring.to, spring.anchor)):
+            if name in bodies:
+                middle, inverse, lightest = bodies[name]
+                arm = np.subtract(point, middle)
+                ends.append((name, float(inverse + lightest * (arm @ arm))))
+        links.append((spring, ends))
+    for hinge in [hinge for hinge in scene.hinge if hinge.turned_by]:
+        links += [(hinge, [(name, bodies[name][2]) for name in (hinge.solid, hinge.to) if name in bodies])]
+    greatest = []  # bounds on the eigenvalues of stiffness and damping, divided by mass
+    for key in ("stiffness", "damping"):
+        traces = dict.fromkeys(bodies, 0.0)
+        for link, ends in links:
+            for name, inverse in ends:
+                traces[name] += float(values.get(f"{link.name}.{key}", getattr(link, key) or 0.0)) * inverse
+        greatest.append(max((sum(traces[name] for name, _ in ends) for _, ends in links), default=0.0))
+    square, rate = greatest
     fastest = rate + sqrt(rate * rate + 4.0 * square)
     return 4.0 / fastest if fastest > 0.0 else inf
-
-
-def _greatest(ends: Sequence[tuple[str, list[tuple[str, float]]]], values: Arrays, key: str) -> float:
-    """Return an upper bound on the greatest eigenvalue of the springs' stiffness or damping, divided by mass."""
-    traces: dict[str, float] = {}
-    for name, bodies in ends:
-        for body, inverse in bodies:
-            traces[body] = traces.get(body, 0.0) + float(values[f"{name}.{key}"]) * inverse
-    return max((sum(traces[body] for body, _ in bodies) for _, bodies in ends), default=0.0)
 
 
 @dataclass(frozen=True)

@@ -295,8 +295,7 @@ class SceneTables(Table):
             return data
         data = dict(data)
         for name, chosen in what_suits(data.get("solver"), data.get("container")):
-            if name in data:
-                given = data[name]
+            if (given := data.get(name)) is not None:
                 is_list = isinstance(given, (list, tuple))
                 data[name] = [_with(one, chosen) for one in given] if is_list else _with(given, chosen)
         return data

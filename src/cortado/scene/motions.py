@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Self
 
@@ -87,20 +86,19 @@ def course_table(parameter: Parameter) -> type[Course]:
     values: Any = (Several[row] | None, Field(None, description="(k, components) one row for each of the times"))
     words = f"The parameter `{parameter.name}` over time: {parameter.meaning}."
     made = create_model(f"Course_{parameter.name}", __base__=Course, __module__=__name__, __doc__=words, values=values)
-    made.columns, made.grows_from = partial(_columns, parameter, unit), None if parameter.unit == "m" else 0.0
+
+    def columns(dimension: int) -> Columns:
+        size = 1 if parameter.components is None else parameter.components(dimension, 1)
+        if size == dimension:
+            return tuple((axis, unit) for axis in "xyz"[:size])
+        return ((parameter.name, unit),) if size == 1 else tuple((f"{parameter.name}_{k}", unit) for k in "xz")
+
+    made.columns, made.grows_from = columns, None if parameter.unit == "m" else 0.0
     return made
 
 
-def _columns(parameter: Parameter, unit: str, dimension: int) -> Columns:
-    size = 1 if parameter.components is None else parameter.components(dimension, 1)
-    if size == dimension:
-        return tuple((axis, unit) for axis in "xyz"[:size])
-    return tuple((name, unit) for name in ([parameter.name] if size == 1 else [f"{parameter.name}_{k}" for k in "xz"]))
-
-
-_OVER_TIME = [p for p in PARAMETERS if p.axis is Axis.STEP]
 _COURSES: dict[str, Any] = {
-    p.name: (course_table(p) | None, Field(default=None, description=p.meaning)) for p in _OVER_TIME
+    p.name: (course_table(p) | None, Field(None, description=p.meaning)) for p in PARAMETERS if p.axis is Axis.STEP
 }
 
 
@@ -128,7 +126,6 @@ class _Schedule(Table):
 Schedule: Any = create_model(
     "Schedule", __base__=_Schedule, __module__=__name__, __doc__=vars(_Schedule)["__doc__"], **_COURSES
 )
-
 AXES = ("turn_x", "turn_y", "turn_z")
 """Suffixes of the rotation fields of a free body."""
 RESTITUTION = 0.6
@@ -222,8 +219,7 @@ def mass_of_one(solid: SolidTable) -> Mass:
         return Mass(size, inertia)
     if solid.gyration_radius is None:
         return Mass(size, size / even.volume * even.inertia)
-    radii = (0.0, 0.0, *solid.gyration_radius)[-3:]
-    return Mass(size, size * np.diag(np.square(radii)))
+    return Mass(size, size * np.diag(np.square((0.0, 0.0, *solid.gyration_radius)[-3:])))
 
 
 def solids_in(fields: Iterable[str]) -> list[str]:
@@ -254,7 +250,7 @@ def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
 
 def _parameters(solid: SolidTable) -> list[Parameter]:
     name, middle, still = solid.name, solid.middle(), np.zeros(len(solid.middle()))
-    unturned = np.zeros(_shape_of(2 * len(middle) - 3))
+    unturned = np.zeros(() if len(middle) == 2 else 3)
     when, (shifts, turns) = " at the start" if solid.motion == "free" else "", courses(solid)
     place = {"change": lambda source, value: np.full(np.shape(value), 10.0 * source.scene.discretisation.spacing)}
     turn = rate = {"change": lambda source, value: np.full(np.shape(value), 1.0)}
@@ -270,6 +266,7 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     turned = f"how far the solid {name} is turned from how it began, after each step"
     heavy, unit = f"the mass of the body {name}", "kg" if len(middle) == 3 else "kg/m"
     bounce = RESTITUTION if solid.restitution is None else solid.restitution
+    speed = f"how fast the middle of the solid {name} is{when}"
     number = {"range": Range.NOT_NEGATIVE, "change": lambda source, value: np.maximum(np.abs(value), 0.1)}
     stretched = f"how many times as large as in the scene the solid {name} is, about its middle"
     return [
@@ -278,9 +275,7 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
         made(scale_name, "", stretched, 1.0, **size),
         made(displacement_name, "m", displaced, still, **steps, **place, course=shifts),
         made(turn_name, "rad", turned, unturned, **steps, **turn, course=turns),
-        made(
-            velocity_name, "m/s", f"how fast the middle of the solid {name} is{when}", solid.velocity or still, **rate
-        ),
+        made(velocity_name, "m/s", speed, solid.velocity or still, **rate),
         made(angular_velocity_name, "rad/s", f"how fast the solid {name} turns about its middle{when}", spin, **rate),
         made(density_name, "kg/m³", f"{heavy} over its volume", solid.density or 0.0, range=Range.POSITIVE),
         made(mass_name, unit, heavy, solid.mass or 0.0, range=Range.POSITIVE),
@@ -289,17 +284,13 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
     ]
 
 
-def _shape_of(components: int) -> tuple[int, ...]:
-    return () if components == 1 else (components,)
-
-
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
     """Return the displacement [m] and the rotation [rad] over time of a solid with prescribed motion."""
     d = len(solid.middle())
     times, shifts, turns = path_of(solid, d) or (None, None, None)
 
     def course(rows: NDArray | None, steady: Any, components: int) -> Steady | Knots:
-        shape = _shape_of(components)
+        shape = () if components == 1 else (components,)
         if rows is not None:
             assert times is not None
             return Knots(times, rows.reshape(len(rows), *shape), solid.interpolation, solid.ramp or 0.0)
@@ -371,12 +362,8 @@ def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _in_space(vector: NDArray[Any]) -> NDArray[np.float64]:
-    found = np.zeros(3)
-    if np.ndim(vector) == 0 or len(vector) == 1:
-        found[2] = np.reshape(vector, ())
-    else:
-        found[: len(vector)] = vector
-    return found
+    given = np.atleast_1d(np.asarray(vector, dtype=np.float64))
+    return np.pad(given, (2, 0) if len(given) == 1 else (0, 3 - len(given)))
 
 
 def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:

@@ -82,10 +82,10 @@ class PackageMaker:
     def _judged(self, parameter: Any) -> Any:
         if not isinstance(parameter, Parameter):
             return parameter
-        given = {one.name: getattr(parameter, one.name) for one in fields(parameter)}
-        own = [name for name, value in given.items() if isfunction(value) and not _is_ours(value)]
         what = f'"{self._kind}" fails in its parameter {parameter.name}:'
-        changes: dict[str, Any] = {name: self._guarded(given[name], what) for name in own}
+        given = {one.name: getattr(parameter, one.name) for one in fields(parameter)}
+        own = {name: value for name, value in given.items() if isfunction(value) and not _is_ours(value)}
+        changes: dict[str, Any] = {name: self._guarded(value, what) for name, value in own.items()}
         return replace(parameter, **changes) if own else parameter
 
     def _guarded(self, method: Callable[..., Any], what: str) -> Callable[..., Any]:
@@ -153,9 +153,9 @@ def registered(group: str, kind: str, own: Collection[str], advice: str) -> Entr
     for entry in found:
         if entry.name in own:
             sentence = (
-                f'cannot be read: {_package_of(entry)} registers "{entry.name}" under {group}, which is a name of '
+                f'cannot be read: {_package_of(entry)} registers "{entry.name}" under {group}, which is a name of'
             )
-            raise SceneError(None, "kind", kind, sentence=f"{sentence}Cortado's own, and must take another.")
+            raise SceneError(None, "kind", kind, sentence=f"{sentence} Cortado's own, and must take another.")
     same = list({(entry.value, _package_of(entry)): entry for entry in found if entry.name == kind}.values())
     if not same:
         names = ", ".join(sorted({f'"{entry.name}"' for entry in found})) or "which there is none"
@@ -210,10 +210,17 @@ def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved:
         if name not in known and len(known) == len(arguments):
             its = f"its keys are {', '.join([*reserved, *known])}"
             raise SceneError(None, name, Words("unknown"), "", f"is not a key of {{table}}; {its}.")
+    adapters, checked = {name: _adapter(arguments[name]) for name in known}, dict(keys)
     for name in known:
         if name not in keys and arguments[name].default is Argument.empty:
-            raise SceneError(None, name, MISSING, _adapter(arguments[name])[1])
-    return {name: _checked(name, value, arguments.get(name)) for name, value in keys.items()}
+            raise SceneError(None, name, MISSING, adapters[name][1])
+    for name in keys:
+        adapter, words = adapters.get(name, (None, ""))
+        try:
+            checked[name] = keys[name] if adapter is None else adapter.validate_python(keys[name])
+        except ValidationError:
+            raise SceneError(None, name, keys[name], words) from None
+    return checked
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Argument] | None:
@@ -238,16 +245,6 @@ def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
         return adapter, wanted(adapter.json_schema(), argument.name)
     except Exception:  # an annotation that is for others
         return None, "given"
-
-
-def _checked(name: str, value: Any, argument: Argument | None) -> Any:
-    adapter, words = _adapter(argument) if argument is not None else (None, "")
-    if adapter is None:
-        return value
-    try:
-        return adapter.validate_python(value)
-    except ValidationError:
-        raise SceneError(None, name, value, words) from None
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:

@@ -61,11 +61,8 @@ class Tilt:
         a, a_dot = np.radians(angles), np.radians(dot)
         sine, sine_derivative = self._factors(a)
         along = (a * a_dot).sum(axis=-1, keepdims=True)
-        return (
-            self._size
-            * np.concatenate([-sine * along, sine * a_dot + sine_derivative * along * a], axis=-1)
-            @ self._axes
-        )
+        change = np.concatenate([-sine * along, sine * a_dot + sine_derivative * along * a], axis=-1)
+        return self._size * change @ self._axes
 
     def adjoint(self, angles: np.ndarray, bar: np.ndarray) -> np.ndarray:
         """Return the adjoint of the angles [1/degree], given the adjoint of gravity."""
@@ -113,13 +110,12 @@ class Known(FixedDict):
         found, arguments = dict(BY_NAME), {argument(name): name for name in BY_NAME}
         for parameter, whose in self._given.items():
             name = parameter.name
-            if argument(name) in arguments:
+            if other := arguments.get(argument(name)):
                 raise InputError(
-                    f"parameter {name} of {whose} has the name of another one, {arguments[argument(name)]}, but must "
-                    f"have its own: give {whose.replace('a ', 'the ')} another name."
+                    f"parameter {name} of {whose} has the name of another one, {other}, but must have its own: give "
+                    f"{whose.replace('a ', 'the ')} another name."
                 )
-            arguments[argument(name)] = name
-            found[name] = parameter
+            arguments[argument(name)], found[name] = name, parameter
         super().__init__(found)
         self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
@@ -151,14 +147,7 @@ class _Passing:
 
 
 TIME = Parameter(
-    "time",
-    "s",
-    "when a step begins",
-    Axis.STEP,
-    lambda source: 0.0,
-    role=Role.CLOCK,
-    moment=0.0,
-    course=_Passing(),
+    "time", "s", "when a step begins", Axis.STEP, lambda source: 0.0, role=Role.CLOCK, moment=0.0, course=_Passing()
 )
 """Parameter for forces that depend on time. Kernels read it from an array (members, steps)."""
 
@@ -169,11 +158,8 @@ def argument(name: str) -> str:
 
 
 REGISTRY = Known()
-
-
 Values = Mapping[str, Any]
 Arrays = dict[str, np.ndarray]
-
 NAMES = names()
 UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
 OVER_TIME = names(axis=Axis.STEP)
@@ -236,20 +222,17 @@ def checked_value(
         raise InputError(f"{what} {name} has shape {array.shape}, but must be {' or '.join(map(str, shapes))}{unit}.")
     if not np.isfinite(array).all():
         raise OutOfRangeError(f"{what} {name} has a value that is not finite, but must be numbers{unit}.")
-    if what != "direction":
-        _check_range(name, array, parameter.range, what)
-    return array
-
-
-def _check_range(name: str, array: np.ndarray, allowed: Range, what: str) -> None:
-    if is_too_small(array, allowed):
-        raise OutOfRangeError(f"{what} {name} is {shown(float(array.min()))}, but must be {allowed.value}.")
-    if allowed is Range.FRACTIONS:
+    if what == "direction":
+        return array
+    if is_too_small(array, parameter.range):
+        raise OutOfRangeError(f"{what} {name} is {shown(float(array.min()))}, but must be {parameter.range.value}.")
+    if parameter.range is Range.FRACTIONS:
         totals = array.sum(axis=-1)
         worst = np.unravel_index(np.abs(totals - 1.0).argmax(), totals.shape)
         if abs(totals[worst] - 1.0) > SUM_TOLERANCE:
             place = f"particle {worst[-1]}" + (f" of scene {worst[0]}" if totals.ndim > 1 else "")
             raise OutOfRangeError(f"{what} {name} of {place} add up to {totals[worst]:g}, but must add up to 1.")
+    return array
 
 
 def stacked(tables: Sequence[Arrays]) -> Arrays:

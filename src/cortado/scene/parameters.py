@@ -106,8 +106,7 @@ class Parameter:
             return [own, (steps, *own)] if steps > 0 else [own]
         if self.axis is Axis.PARTICLE:
             return [(particles, *own)]
-        several = self.axis is Axis.PHASE and (phases > 1 or own)
-        return [(phases, *own) if several else own]
+        return [(phases, *own) if self.axis is Axis.PHASE and (phases > 1 or own) else own]
 
 
 def _vector(dimension: int, phases: int) -> int:
@@ -137,10 +136,6 @@ def _has_several_phases(scene: Any) -> bool:
     return len(scene.phase) > 1
 
 
-def _diffuses(source: Source, values: Mapping[str, NDArray]) -> bool:
-    return bool(values["mobility"] > 0.0)
-
-
 def _of_particles(name: str, unit: str, meaning: str, value: Callable[[Source], Any], **more: Any) -> Parameter:
     """Build a parameter of the particles' initial state."""
     more = {"components": _vector, "role": Role.STATE, **more}
@@ -153,9 +148,13 @@ def _of_phases(name: str, unit: str, meaning: str, key: str = "", **more: Any) -
     return Parameter(name, unit, meaning, Axis.PHASE, lambda s: list(map(of_each, s.scene.phase)), **more)
 
 
-def _of_mixture(name: str, unit: str, meaning: str, value: Callable[[Source], Any], allowed: Range) -> Parameter:
-    own: Any = {"acts": _diffuses, "present": _has_several_phases, "absent": "has only one phase", "range": allowed}
-    return Parameter(name, unit, meaning, Axis.SCALAR, value, **own)
+def _of_mixture(name: str, unit: str, meaning: str, allowed: Range) -> Parameter:
+    def value(source: Source) -> float:
+        mixture = source.scene.mixture
+        return mixture.mobility if name == "mobility" else mixture.width(spacing_of(source))
+
+    own: Any = {"acts": lambda source, values: bool(values["mobility"] > 0.0), "present": _has_several_phases}
+    return Parameter(name, unit, meaning, Axis.SCALAR, value, range=allowed, absent="has only one phase", **own)
 
 
 def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
@@ -166,31 +165,9 @@ def _capillary_step(scene: Any, values: Mapping[str, Any]) -> float:
     return part * float(np.sqrt(density * scene.discretisation.spacing**3 / tension)) if tension > 0.0 else inf
 
 
-def _optional(
-    name: str, unit: str, meaning: str, force: str, longest_step: Limit = lambda scene, values: inf
-) -> Parameter:
-    return Parameter(
-        name,
-        unit,
-        meaning,
-        Axis.SCALAR,
-        lambda source: getattr(source.scene.forces, name),
-        range=Range.NOT_NEGATIVE,
-        present=lambda scene: getattr(scene.forces, name) is not None,
-        absent=f"has no {name.replace('_', ' ')} in [forces]",
-        force=force,
-        is_optional=True,
-        longest_step=longest_step,
-    )
-
-
 PARAMETERS = (
     Parameter(
-        "gravity",
-        "m/s²",
-        "acceleration that acts on all fluid",
-        Axis.STEP,
-        lambda s: s.scene.forces.gravity,
+        *("gravity", "m/s²", "acceleration that acts on all fluid", Axis.STEP, lambda s: s.scene.forces.gravity),
         components=_vector,
         change=_size_of_gravity,
         force="cortado.sph.gravity",
@@ -225,39 +202,30 @@ PARAMETERS = (
     ),
     _of_phases("rest_density", "kg/m³", "density of the fluid at rest", range=Range.POSITIVE),
     _of_phases(
-        "viscosity",
-        "Pa s",
-        "dynamic viscosity",
+        *("viscosity", "Pa s", "dynamic viscosity"),
         range=Range.NOT_NEGATIVE,
         present=lambda scene: scene.forces.viscosity != "none",
         absent='has viscosity = "none" in [forces]',
         force="cortado.sph.viscosity",
     ),
-    _optional("surface_tension", "N/m", "tension of the free surface", "cortado.sph.surface_tension", _capillary_step),
     Parameter(
-        "time_step",
-        "s",
-        "length of a step",
-        Axis.SCALAR,
-        lambda s: s.scene.solver.time_step,
+        *("surface_tension", "N/m", "tension of the free surface"),
+        *(Axis.SCALAR, lambda s: s.scene.forces.surface_tension),
+        range=Range.NOT_NEGATIVE,
+        present=lambda scene: scene.forces.surface_tension is not None,
+        absent="has no surface tension in [forces]",
+        force="cortado.sph.surface_tension",
+        is_optional=True,
+        longest_step=_capillary_step,
+    ),
+    Parameter(
+        *("time_step", "s", "length of a step", Axis.SCALAR, lambda s: s.scene.solver.time_step),
         range=Range.POSITIVE,
         present=lambda scene: not scene.solver.chooses,
         absent='chooses its time steps, by solver.time_step = "auto", and derivatives hold them constant',
     ),
-    _of_mixture(
-        "mobility",
-        "m²/s",
-        "how fast phases diffuse into one another",
-        lambda s: s.scene.mixture.mobility,
-        Range.NOT_NEGATIVE,
-    ),
-    _of_mixture(
-        "interface_width",
-        "m",
-        "width of the interface between phases",
-        lambda s: s.scene.mixture.width(spacing_of(s)),
-        Range.POSITIVE,
-    ),
+    _of_mixture("mobility", "m²/s", "how fast phases diffuse into one another", Range.NOT_NEGATIVE),
+    _of_mixture("interface_width", "m", "width of the interface between phases", Range.POSITIVE),
     _of_phases(
         "colours",
         "",

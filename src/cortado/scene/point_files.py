@@ -97,17 +97,6 @@ def _check_count(count: int) -> None:
         raise Refused(f"holds {count} points, but must hold from 1 to {MOST_POINTS}")
 
 
-def _limit_memory(size: int) -> None:
-    try:
-        import resource
-    except ImportError:  # on Windows
-        return
-    most = ROOM + 20 * size
-    for what, limit in ((resource.RLIMIT_DATA, most), (resource.RLIMIT_CORE, 0)):
-        hardest = resource.getrlimit(what)[1]
-        resource.setrlimit(what, (limit if hardest == resource.RLIM_INFINITY else min(limit, hardest), hardest))
-
-
 def main(path: str) -> int:
     """Read a file of points, write them for the parent process, and return the exit code."""
     output, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -115,7 +104,14 @@ def main(path: str) -> int:
         os.dup2(nothing, terminal)
     code, content = 0, io.BytesIO()
     try:
-        _limit_memory(os.stat(path).st_size)
+        if sys.platform != "win32":
+            import resource
+
+            most = ROOM + 20 * os.stat(path).st_size
+            for what, limit in ((resource.RLIMIT_DATA, most), (resource.RLIMIT_CORE, 0)):
+                hardest = resource.getrlimit(what)[1]
+                limit = limit if hardest == resource.RLIM_INFINITY else min(limit, hardest)
+                resource.setrlimit(what, (limit, hardest))
         np.save(content, READERS[Path(path).suffix](path), allow_pickle=False)
     except Refused as problem:
         code, content = REFUSED, io.BytesIO(str(problem).encode())

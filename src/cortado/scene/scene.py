@@ -17,13 +17,13 @@ from cortado.calls import counted, point_in_words, public
 from cortado.device.threads import require, sampling_parts
 from cortado.errors import LONGEST, InputError, SceneError, Words, shown, warn
 from cortado.files.disk import as_path, content, reason
-from cortado.scene.checks import check_bounded, check_scene
+from cortado.scene.checks import check_scene
 from cortado.scene.model import OTHER_TABLES, SceneTables
 from cortado.scene.restart import RestartState
 from cortado.scene.scene_warnings import check_idle, creep_sentence, idle_sentences, viscosity_sentence
 from cortado.scene.shape_tables import BoxContainer, CylinderContainer
-from cortado.scene.stability import broken_limits, longest_step
-from cortado.scene.tables import sentences
+from cortado.scene.stability import broken_limits, chosen_limits, longest_step
+from cortado.scene.tables import MISSING, field_error, sentences
 
 
 @public
@@ -53,7 +53,9 @@ class Scene(SceneTables):
         check_idle(self)
         time_step = self.solver.time_step
         if time_step == "auto":
-            check_bounded(self)
+            if not np.isfinite(min(chosen_limits(self).values())):
+                wanted = "given, as nothing else bounds the time step of this scene where the fluid rests"
+                raise field_error(("solver", "greatest_time_step"), MISSING, wanted)
         elif broken := broken_limits(self, {}, time_step):
             name, limit = broken[0]
             found = f"solver.time_step is {time_step:g} s, but the limit of stability is about {limit:.3g} s"
@@ -136,7 +138,7 @@ class Scene(SceneTables):
         return scene_from_dict(data)
 
 
-def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
+def _in_other_units(scene: SceneTables) -> Iterator[str]:
     for phase in scene.phase:
         if phase.rest_density < 50.0:  # liquid hydrogen has 71 kg/m3, and mercury in g/cm3 would have 13.5
             found = f"the rest_density of {phase.name} is {phase.rest_density:g} kg/m3"
@@ -148,18 +150,13 @@ def _in_other_units(scene: SceneTables) -> Iterator[str | None]:
             turn = float(np.linalg.norm(getattr(body, "rotation", None) or 0.0))
             if turn > 2.0 * np.pi:
                 yield f"{name}[{index}].rotation is {turn:g} rad, more than a whole turn: is it in degrees?"
-    yield _millimetres(scene)
-
-
-def _millimetres(scene: SceneTables) -> str | None:
     densities, spacing = {phase.name: phase.rest_density for phase in scene.phase}, scene.discretisation.spacing
     cells = sum(fluid.count(spacing) * densities[fluid.phase] for fluid in scene.fluid)
     mass, strength = cells * spacing**scene.dimension, np.linalg.norm(scene.forces.gravity)
     heaviest = {2: 3e5, 3: 3e6}[scene.dimension]  # kg: water of 30 m x 10 m, in space 10 m deep
-    if mass < heaviest or not 0.1 < strength / 9.81 < 10.0:
-        return None
-    layer = " in a layer of 1 m" if scene.dimension == 2 else ""
-    return f"the fluid weighs about {mass:.2g} kg{layer}: are its lengths in millimetres? A scene has metres."
+    if mass >= heaviest and 0.1 < strength / 9.81 < 10.0:
+        layer = " in a layer of 1 m" if scene.dimension == 2 else ""
+        yield f"the fluid weighs about {mass:.2g} kg{layer}: are its lengths in millimetres? A scene has metres."
 
 
 def _given(value: Any) -> Any:
@@ -214,40 +211,29 @@ def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
 
 
 def scene_in_words(scene: Scene, particles: int) -> str:
-    phases = " and ".join(
-        f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase
-    )
-    emitter = f" of which {counted(len(scene.emitter), 'emitter')} give some," if scene.emitter else ""
-    return (
-        f"{counted(particles, 'particle')} of {phases} in {scene.dimension}-D,{emitter} "
-        f"{scene.discretisation.spacing:g} m apart at rest, {_held(scene)}, "
-        f"under gravity {point_in_words(scene.forces.gravity)} m/s²{_scheduled(scene)}."
-    )
-
-
-def _scheduled(scene: Scene) -> str:
-    courses = [
+    phases = [f"{phase.name} ({phase.rest_density:g} kg/m³, {phase.viscosity:g} Pa s)" for phase in scene.phase]
+    changes = [
         f"{name.replace('_', ' ')} changes from {course.times[0]:g} s to {course.times[-1]:g} s"
         for name, course in scene.schedule.courses.items()
     ]
-    return f"; its {' and '.join(courses)}" if courses else ""
-
-
-def _held(scene: Scene) -> str:
-    container = scene.container
+    container, held = scene.container, "in free space"
     if isinstance(container, CylinderContainer):
-        return f"in a cup of radius {container.radius:g} m and height {container.height:g} m"
-    if isinstance(container, BoxContainer):
-        lower, upper = container.extent()
-        return f"in a box of {' × '.join(f'{length:g}' for length in upper - lower)} m"
-    return "in free space"
+        held = f"in a cup of radius {container.radius:g} m and height {container.height:g} m"
+    elif isinstance(container, BoxContainer):
+        lengths = np.subtract(container.upper, container.lower)
+        held = f"in a box of {' × '.join(f'{length:g}' for length in lengths)} m"
+    emitter = f" of which {counted(len(scene.emitter), 'emitter')} give some," if scene.emitter else ""
+    return (
+        f"{counted(particles, 'particle')} of {' and '.join(phases)} in {scene.dimension}-D,{emitter} "
+        f"{scene.discretisation.spacing:g} m apart at rest, {held}, under gravity "
+        f"{point_in_words(scene.forces.gravity)} m/s²{'; its ' if changes else ''}{' and '.join(changes)}."
+    )
 
 
 MOST_BYTES = 1_000_000
 """Greatest size of a scene file [byte]."""
 MOST_PARTS = 10
 """Greatest number of parts of a dotted key."""
-
 _ASIDE = re.compile(
     r'''#[^\n]*|"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.)*+"?'''
     r"""|'{3}(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?""",
@@ -275,17 +261,18 @@ def read_toml(
         data = tomllib.loads(text)
     except UnicodeDecodeError as problem:
         line = problem.object[: problem.start].count(b"\n") + 1
-        raise _unreadable(file, f"is not text in UTF-8 (at line {line}).") from None
+        raise SceneError(file, "", sentence=f"is not text in UTF-8 (at line {line}).") from None
     except (ValueError, RecursionError) as problem:  # among them TOMLDecodeError, which names the line
         problem.__traceback__ = None  # it may have a thousand frames, too many to be pickled where a library does so
         if file.endswith(".json"):
-            raise _unreadable(file, "is not TOML: Scene.from_json reads what Scene.to_json wrote.") from None
+            sentence = "is not TOML: Scene.from_json reads what Scene.to_json wrote."
+            raise SceneError(file, "", sentence=sentence) from None
         said = _TWICE.sub(r"\g<0>; entries of a list are written [[\1]]", reason(problem))
-        raise _unreadable(file, f"is not valid TOML: {said}.") from None
+        raise SceneError(file, "", sentence=f"is not valid TOML: {said}.") from None
     except OSError as problem:
         beside = _beside(file) if isinstance(problem, FileNotFoundError) else None
         there = f"; did you mean {beside}?" if beside else "."
-        raise _unreadable(file, f"cannot be read: {reason(problem)}{there}") from None
+        raise SceneError(file, "", sentence=f"cannot be read: {reason(problem)}{there}") from None
     return put_in(data, overrides, file, unread)
 
 
@@ -326,20 +313,17 @@ def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Se
     return data
 
 
-def _unreadable(file: str, sentence: str) -> SceneError:
-    return SceneError(file, "", sentence=sentence)
-
-
 def _require_shallow(text: str, file: str) -> None:
     """Raise `SceneError` for a dotted key with too many parts. Call this before the parser."""
     plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
-    deep = _TOO_DEEP.search(plain)
-    if deep:
+    if deep := _TOO_DEEP.search(plain):
         raise _too_deep(file, deep[0])
 
 
 def _too_deep(file: str, key: str) -> SceneError:
-    return _unreadable(file, f"has a key of more than {MOST_PARTS} parts, {shown(key)}, but no table lies that deep.")
+    return SceneError(
+        file, "", sentence=f"has a key of more than {MOST_PARTS} parts, {shown(key)}, but no table lies that deep."
+    )
 
 
 def _apply(data: dict[str, Any], override: str, file: str) -> None:
@@ -347,23 +331,29 @@ def _apply(data: dict[str, Any], override: str, file: str) -> None:
         sentence = f"is the beginning of {len(override)} characters, but an override must have at most {MOST_BYTES}."
         raise SceneError(file, shown(override), sentence=sentence)
     _require_shallow(override, file)
-    key, equals, text = override.partition("=")
-    key = key.strip()
+    key, equals, text = map(str.strip, override.partition("="))
     if not equals or not _KEY.fullmatch(key):
         raise SceneError(file, shown(override), sentence="is not an override of the form key=value.")
     parts = key.replace("[", ".").replace("]", "").split(".")
     if len(parts) > MOST_PARTS:
         raise _too_deep(file, key)
+    try:
+        parsed = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        parsed = {}
     place: Any = data
     for depth, part in enumerate(parts):
         index: Any = _entry(place, part) if isinstance(place, list) else part
         if index is None:
-            raise SceneError(file, _short(".".join(parts[: depth + 1])), part, _entries(place))
+            found, wanted = _names(place), f"an index from 0 to {len(place) - 1}"
+            wanted = f"{wanted}, or the name {' or '.join(found)}" if found else wanted
+            wanted = wanted if place else "left out, as the list is empty"
+            raise SceneError(file, _short(".".join(parts[: depth + 1])), part, wanted)
         if not isinstance(place, (dict, list)):
             sentence = f"cannot be set, as {'.'.join(parts[:depth])[:LONGEST]} is not a table."
             raise SceneError(file, _short(key), sentence=sentence)
         if depth == len(parts) - 1:
-            place[index] = _value(text.strip())
+            place[index] = parsed["value"] if parsed.keys() == {"value"} else text
         else:
             place = place[index] if isinstance(place, list) else place.setdefault(part, {})
 
@@ -378,22 +368,6 @@ def _entry(tables: list[Any], part: str) -> int | None:
     return next((k for k, table in enumerate(tables) if part in _names([table])), None)
 
 
-def _entries(tables: list[Any]) -> str:
-    if not tables:
-        return "left out, as the list is empty"
-    names = _names(tables)
-    wanted = f"an index from 0 to {len(tables) - 1}"
-    return f"{wanted}, or the name {' or '.join(names)}" if names else wanted
-
-
 def _names(tables: list[Any]) -> list[str]:
     found = (table.get("name", table.get("kind")) for table in tables if isinstance(table, dict))
     return [str(name) for name in found if name is not None]
-
-
-def _value(text: str) -> Any:
-    try:
-        parsed = tomllib.loads(f"value = {text}")
-    except (ValueError, RecursionError):
-        return text
-    return parsed["value"] if parsed.keys() == {"value"} else text

@@ -9,7 +9,7 @@ import numpy as np
 from cortado.calls import point_in_words
 from cortado.discretise.room import Room
 from cortado.discretise.solid_walls import surface_feet
-from cortado.scene.appearance import Keyframes, Picture
+from cortado.scene.appearance import Keyframes
 from cortado.scene.courses import Steady
 from cortado.scene.fluids import PointsFluid
 from cortado.scene.model import Carreau, SceneTables, Thinning, Yielding
@@ -61,20 +61,17 @@ def _idle(scene: SceneTables) -> Iterator[Idle]:
     if forces.viscosity != "stress":
         yield ("forces",), forces, ("viscous_solve",), f'viscosity is "{forces.viscosity}", and not "stress"'
     if np.all(getattr(scene.container, "periodic", False)):
-        names = ("slip", "material", "colour")
-        yield ("container",), scene.container, names, "it has no walls where all axes are periodic"
+        walls = ("slip", "material", "colour")
+        yield ("container",), scene.container, walls, "it has no walls where all axes are periodic"
     if scene.dimension == 2:
         tables: list[tuple[FieldPath, Table]] = [(("phase", index), phase) for index, phase in enumerate(scene.phase)]
-        for path, table in [*tables, (("container",), scene.container)]:
+        for place, table in [*tables, (("container",), scene.container)]:
             if "colour" in table.model_fields_set and getattr(table, "colour", None) is not None:
-                yield path, table, ("material",), "colour is given, which is all that a plane shows of it"
-    if scene.picture is not None:
-        yield from _idle_in_picture(scene.picture, scene.dimension)
-
-
-def _idle_in_picture(picture: Picture, dimension: int) -> Iterator[Idle]:
-    path = ("picture",)
-    if dimension == 2:
+                yield place, table, ("material",), "colour is given, which is all that a plane shows of it"
+    picture, path = scene.picture, ("picture",)
+    if picture is None:
+        return
+    if scene.dimension == 2:
         yield path, picture, OF_SPACE, "the scene has 2 dimensions"
         if picture.background is not None:
             yield path, picture, ("light",), "background is given, which is all that a plane shows of it"

@@ -1,15 +1,14 @@
 """Tables of sensors, which record numbers of a run in every step."""
 
 import unicodedata
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from cortado.scene.shape_tables import check_order
-from cortado.scene.tables import FieldPath, Length, Table, Text, Vector, field_error, quantity
+from cortado.scene.shape_tables import Ordered
+from cortado.scene.tables import Direction, Length, OnAxes, Table, Text, Vector, field_error, quantity
 
 Reach = Annotated[float, quantity("m", gt=0.0)] | None
-Corner = tuple[Length, ...] | None
 Axes = Literal["world", "body"]
 
 
@@ -27,10 +26,6 @@ class SensorTable(Table):
             wanted = "one line of text that begins with none of = + - @, as it heads a column of a table"
             raise field_error((), name, wanted)
         return name
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        self.check_components(("lower", "upper", "about"), dimension, path)
-        return super().in_dimension(dimension, path)
 
 
 class PressureProbeTable(SensorTable):
@@ -72,41 +67,28 @@ class FlowRateTable(SensorTable):
     """Kind of the sensor."""
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
-    normal: Vector[Annotated[float, quantity()]]
+    normal: Direction
     """(d,) Direction of positive flow."""
     reach: Reach = None
     """Half the thickness of the measured layer of fluid [m]. If left out, two support radii, but at least five
     spacings."""
 
-    @field_validator("normal")
-    @classmethod
-    def _check_normal(cls, normal: tuple[float, ...]) -> tuple[float, ...]:
-        if not any(normal):
-            raise field_error((), normal, "a vector that is not zero")
-        return normal
 
-
-class WallForceTable(SensorTable):
+class WallForceTable(SensorTable, Ordered):
     """A sensor of the force and torque of the fluid on walls in a region."""
 
     kind: Literal["wall_force"]
     """Kind of the sensor."""
-    lower: Corner = None
+    lower: OnAxes[Length] = None
     """(d,) Lower corner of the region [m]; if left out, the region has no lower end."""
-    upper: Corner = None
+    upper: OnAxes[Length] = None
     """(d,) Upper corner of the region [m]; if left out, the region has no upper end."""
-    about: Corner = None
+    about: OnAxes[Length] = None
     """(d,) Reference point of the torque [m]; the origin if left out."""
     on: Text | None = None
     """Name of a moving solid that carries the region and the reference point along."""
     axes: Axes = "world"
     """Axes of force and torque: "world", or "body" for axes that rotate with the solid named by `on`."""
-
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        if self.lower is not None and self.upper is not None:
-            check_order(self.lower, self.upper)
-        return self
 
 
 class SolidLoadTable(SensorTable):
@@ -138,13 +120,5 @@ class BodyMotionTable(SensorTable):
     """Name of the free body."""
 
 
-AnySensor = Annotated[
-    PressureProbeTable
-    | WaveGaugeTable
-    | FlowRateTable
-    | WallForceTable
-    | SolidLoadTable
-    | SpringForceTable
-    | BodyMotionTable,
-    Field(discriminator="kind"),
-]
+_OfFluid = PressureProbeTable | WaveGaugeTable | FlowRateTable | WallForceTable | SolidLoadTable
+AnySensor = Annotated[_OfFluid | SpringForceTable | BodyMotionTable, Field(discriminator="kind")]

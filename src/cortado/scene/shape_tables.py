@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -19,17 +20,11 @@ from cortado.discretise.solid import Hollow, Placed, Solid
 from cortado.discretise.walls import Places, box_places, box_walls, cup_places, cup_walls, short_box
 from cortado.errors import Words
 from cortado.scene.appearance import FINISHES, Finish
-from cortado.scene.tables import Colour, FieldPath, Flag, Length, OneOf, Table, Text, Vector, field_error, quantity
+from cortado.scene.tables import Colour, Flag, Length, OneOf, Table, Text, Vector, field_error, quantity
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 THIN = 2.5
 """Greatest thickness of a part of a mesh that counts as a sheet [spacings]."""
-
-
-def check_order(lower: tuple[float, ...], upper: tuple[float, ...]) -> None:
-    """Check that each component of ``lower`` is less than the component of ``upper`` along the same axis."""
-    if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
-        raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
 
 
 def _beside_scene(file: str, info: ValidationInfo) -> str:
@@ -43,7 +38,19 @@ def _beside_scene(file: str, info: ValidationInfo) -> str:
 File = Annotated[Text, AfterValidator(_beside_scene)]
 
 
-class BoxShape(Table):
+class Ordered(Table):
+    """A table with corners of which each component of `lower` is less than that of `upper`."""
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        own: Any = self
+        lower, upper = own.lower or (), own.upper or ()
+        if len(lower) == len(upper) and any(b <= a for a, b in zip(lower, upper, strict=True)):
+            raise field_error(("upper",), upper, f"greater than lower, {list(lower)}, in every component")
+        return self
+
+
+class BoxShape(Ordered):
     """A box, or a rectangle in 2-D."""
 
     shape: Literal["box"] = "box"
@@ -51,11 +58,6 @@ class BoxShape(Table):
     """(d,) Corner with the smallest coordinates [m], before a rotation."""
     upper: Vector[Length]
     """(d,) Corner with the greatest coordinates [m], before a rotation."""
-
-    @model_validator(mode="after")
-    def _check_order(self) -> Self:
-        check_order(self.lower, self.upper)
-        return self
 
     def shape_about(self) -> tuple[Solid, Points]:
         return Box(0.5 * np.subtract(self.upper, self.lower)), 0.5 * np.add(self.lower, self.upper)
@@ -77,8 +79,6 @@ class SphereShape(Table):
 class CylinderShape(Table):
     """A cylinder, in 3-D."""
 
-    instead: ClassVar[str]
-    """Names of the shapes to use in 2-D."""
     shape: Literal["cylinder"] = "cylinder"
     base: Vector[Length]
     """(3,) Centre of the bottom [m]."""
@@ -94,11 +94,6 @@ class CylinderShape(Table):
         """Return the index of the axis."""
         return INDEX_OF_AXIS[self.axis]
 
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 2:
-            raise field_error((*path, "shape"), "cylinder", f"{self.instead} in 2-D")
-        return super().in_dimension(dimension, path)
-
     def shape_about(self) -> tuple[Solid, Points]:
         middle = np.array(self.base) + 0.5 * self.height * np.eye(3)[self.along]
         return Revolved(Box(np.array([self.radius, 0.5 * self.height])), self.along), middle
@@ -107,6 +102,7 @@ class CylinderShape(Table):
 class PolygonShape(Table):
     """A polygon, in 2-D."""
 
+    _instead: ClassVar = {3: '"box", "sphere", "capsule", "cylinder" or "cup"'}
     shape: Literal["polygon"] = "polygon"
     corners: Annotated[
         tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)], ...], Field(min_length=3)
@@ -116,16 +112,9 @@ class PolygonShape(Table):
     @model_validator(mode="after")
     def _check_sides(self) -> Self:
         if crossing := _crossing(np.array(self.corners)):
-            first, second = crossing
-            wanted = f"corners of sides that do not cross, as sides {first} and {second} do"
+            wanted = "corners of sides that do not cross, as sides {} and {} do".format(*crossing)
             raise field_error(("corners",), self.corners, wanted)
         return self
-
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 3:
-            others = '"box", "sphere", "capsule", "cylinder" or "cup" in 3-D'
-            raise field_error((*path, "shape"), "polygon", others)
-        return super().in_dimension(dimension, path)
 
     def shape_about(self) -> tuple[Solid, Points]:
         corners = np.array(self.corners)
@@ -136,34 +125,30 @@ class PolygonShape(Table):
 class MeshShape(Table):
     """The inside of a mesh of triangles, in 3-D."""
 
+    _instead: ClassVar = {2: '"box", "sphere", "capsule", "cup" or "polygon"'}
     shape: Literal["mesh"] = "mesh"
     file: File
     """Name of an STL, OBJ, PLY, glTF or GLB file. A relative path starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
     """Factor of all lengths in the file, such as 0.001 for millimetres."""
 
-    def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        if dimension == 2:
-            raise field_error((*path, "shape"), "mesh", '"box", "sphere", "capsule", "cup" or "polygon" in 2-D')
-        return super().in_dimension(dimension, path)
-
-    def shape_about(self) -> tuple[Solid, Points]:
+    def shape_about(self) -> tuple[Mesh, Points]:
         return _about_middle(mesh_in_file(self.file), self.scale)
 
-    def thinnest_sheet(self, spacing: float) -> float:
-        """Return the thickness of the thinnest sheet in the mesh [m]; infinite without sheets."""
-        return _thinnest_sheet(mesh_in_file(self.file), self.scale, THIN * spacing)
+    def thinnest(self, spacing: float) -> float:
+        """Return the thickness of the thinnest sheet [m]; infinite without sheets."""
+        return _thickness(self.shape_about()[0], THIN * spacing)
+
+
+@lru_cache(maxsize=8)  # as this takes thousands of points
+def _thickness(mesh: Mesh, reach: float) -> float:
+    return thickness_of(mesh, reach).thinnest
 
 
 @lru_cache(maxsize=8)  # as a mesh builds a tree
 def _about_middle(found: FoundMesh, scale: float) -> tuple[Mesh, Points]:
     middle = found.mesh.moments().centre
     return found.mesh.moved(scale, -scale * middle), scale * (found.origin + middle)
-
-
-@lru_cache(maxsize=8)  # as this takes thousands of points
-def _thinnest_sheet(found: FoundMesh, scale: float, reach: float) -> float:
-    return thickness_of(_about_middle(found, scale)[0], reach).thinnest
 
 
 def surface_cells(lower: Points, upper: Points, spacing: float) -> float:
@@ -179,19 +164,18 @@ def _crossing(corners: Points) -> tuple[int, int] | None:
     def turned(a: Points, b: Points) -> float:
         return float(a[0] * b[1] - a[1] * b[0])
 
-    for first in range(count):
-        if not sides[first].any():
-            return first, first
-        for second in range(first + 1, count):
-            apart = corners[second] - corners[first]
-            across = turned(sides[first], sides[second])
-            if (second - first) in (1, count - 1):  # neighbours, which may only lie on each other
-                if across == 0.0 and sides[first] @ sides[second] < 0.0:
-                    return first, second
-            elif across != 0.0:
-                along = turned(apart, sides[second]) / across, turned(apart, sides[first]) / across
-                if all(0.0 <= part <= 1.0 for part in along):
-                    return first, second
+    for first, second in combinations_with_replacement(range(count), 2):
+        one, other, apart = sides[first], sides[second], corners[second] - corners[first]
+        across = turned(one, other)
+        if first == second:
+            crosses = not one.any()
+        elif second - first in (1, count - 1):  # neighbours, which may only lie on each other
+            crosses = across == 0.0 and one @ other < 0.0
+        else:
+            along = (turned(apart, side) / across for side in (other, one))
+            crosses = across != 0.0 and all(0.0 <= part <= 1.0 for part in along)
+        if crosses:
+            return first, second
     return None
 
 
@@ -328,7 +312,7 @@ class BoxContainer(Walled, BoxShape, Container):
 class CylinderContainer(Walled, CylinderShape, Container):
     """A cylindrical container, with or without a lid, in 3-D."""
 
-    instead: ClassVar = '"box" or "none"'
+    _instead: ClassVar = {2: '"box" or "none"'}
     lid: Flag = True
     """Whether the cylinder is closed at the top. Without a lid, fluid may rise above the rim."""
 
@@ -339,12 +323,11 @@ class CylinderContainer(Walled, CylinderShape, Container):
         return lower, upper
 
     def region(self, dimension: int) -> Region:
-        axis = self.along
-        closed = Region.cylinder(np.array(self.base), self.radius, self.height, axis)
+        closed = Region.cylinder(np.array(self.base), self.radius, self.height, self.along)
         if self.lid:
             return closed
-        is_along = np.arange(3) == axis
-        return replace(closed, upper=np.where(is_along, np.inf, closed.upper), rim=float(closed.upper[axis]))
+        upper = np.where(np.arange(3) == self.along, np.inf, closed.upper)
+        return replace(closed, upper=upper, rim=float(closed.upper[self.along]))
 
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
         axis, height = self.along, self.height if self.lid else 2.0 * self.height
@@ -371,8 +354,8 @@ def check_length(container: Container, spacing: float, support_radius: float) ->
         return
     lengths = ends[1] - ends[0]
     if lengths.min() < spacing * (1.0 - 1e-6):
-        found = Words(f"only {lengths.min():g} m wide")
-        raise field_error(("container",), found, f"at least one spacing, {spacing:g} m, wide")
+        wanted = f"at least one spacing, {spacing:g} m, wide"
+        raise field_error(("container",), Words(f"only {lengths.min():g} m wide"), wanted)
     periods = container.periods(len(lengths))[1]
     short = (periods > 0.0) & (periods <= 2.0 * support_radius)
     if short.any():

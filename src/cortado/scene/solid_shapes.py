@@ -15,7 +15,7 @@ from cortado.errors import InputError, Words
 from cortado.files.disk import cached_by_file
 from cortado.scene.shape_tables import BoxShape, Container, CylinderShape, File, MeshShape, PolygonShape, SphereShape
 from cortado.scene.solids import SolidTable
-from cortado.scene.tables import MISSING, FieldPath, Length, Vector, field_error, quantity, usable_file
+from cortado.scene.tables import MISSING, Direction, FieldPath, Length, Vector, field_error, quantity, usable_file
 
 ALONG = 1e-9
 
@@ -26,20 +26,19 @@ class PlaneSolid(SolidTable):
     shape: Literal["plane"] = "plane"
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
-    normal: Vector[Annotated[float, quantity()]]
+    normal: Direction
     """(d,) Normal that points from the plane into the fluid; its length has no effect."""
     _ends: tuple[tuple[float, ...], ...] | None = PrivateAttr(None)
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         turned = super().in_dimension(dimension, path)
-        if not any(self.normal):
-            raise field_error((*path, "normal"), self.normal, "a vector that is not 0")
+
         if self.side == "inside":
             raise field_error((*path, "side"), self.side, '"outside": fluid is where the normal of a plane points')
         if self.rotation is not None:
             raise field_error((*path, "rotation"), self.rotation, "left out, as normal says how a plane is turned")
-        for name, value in (("motion", self.motion), ("surface_velocity", self.surface_velocity)):
-            if value not in ("fixed", None):
+        for name in ("motion", "surface_velocity"):
+            if (value := getattr(self, name)) not in ("fixed", None):
                 raise field_error((*path, name), value, 'left out, as a plane is at rest; a "box" may move')
         return turned
 
@@ -114,7 +113,7 @@ class CylinderSolid(CylinderShape, SolidTable):
     """A solid cylinder, in 3-D."""
 
     measures: ClassVar = ("base", "radius", "height")
-    instead: ClassVar = '"box", "sphere", "capsule", "cup" or "polygon"'
+    _instead: ClassVar = {2: '"box", "sphere", "capsule", "cup" or "polygon"'}
 
     def thinnest(self, spacing: float) -> float:
         return min(2.0 * self.radius, self.height)
@@ -182,9 +181,6 @@ class MeshSolid(MeshShape, SolidTable):
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.5
 
-    def thinnest(self, spacing: float) -> float:
-        return self.thinnest_sheet(spacing)
-
 
 FLAT = 1e-6
 """Greatest distance of a flat sheet's corners from a plane, relative to the size of the sheet."""
@@ -211,11 +207,8 @@ class SheetSolid(SolidTable):
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         turned = super().in_dimension(dimension, path)
-        for name, value, wanted in (
-            ("side", self.side, "outside"),
-            ("surface_velocity", self.surface_velocity, None),
-        ):
-            if value != wanted:
+        for name, usual in (("side", "outside"), ("surface_velocity", None)):
+            if (value := getattr(self, name)) != usual:
                 raise field_error((*path, name), value, "left out, as a sheet has fluid on both sides")
         if self.motion == "free":
             raise field_error((*path, "motion"), "free", '"fixed" or "path", as a sheet has no mass')
@@ -275,15 +268,5 @@ def _sheet_in(path: str) -> Sheet:
     return Sheet(places, found.corners[with_area])
 
 
-AnySolid = Annotated[
-    BoxSolid
-    | SphereSolid
-    | CapsuleSolid
-    | CylinderSolid
-    | CupSolid
-    | PolygonSolid
-    | PlaneSolid
-    | MeshSolid
-    | SheetSolid,
-    Field(discriminator="shape"),
-]
+_Simple = BoxSolid | SphereSolid | CapsuleSolid | CylinderSolid | CupSolid | PolygonSolid
+AnySolid = Annotated[_Simple | PlaneSolid | MeshSolid | SheetSolid, Field(discriminator="shape")]

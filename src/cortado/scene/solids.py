@@ -9,24 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cortado.discretise.shapes import Points
-from cortado.discretise.solid import Hollow, Placed, Solid
+from cortado.discretise.solid import Hollow, Placed, Solid, rotation_matrix
 from cortado.scene.appearance import FINISHES, Coloured, Finish
 from cortado.scene.courses import WAYS, Interpolation, Ramp, check_motion
 from cortado.scene.shape_tables import Container, File, surface_cells
-from cortado.scene.tables import (
-    Colour,
-    FieldPath,
-    Inertia,
-    Length,
-    OneOf,
-    Radii,
-    Rotation,
-    Text,
-    Turning,
-    check_name,
-    quantity,
-    rotation_matrix,
-)
+from cortado.scene.tables import Angle, Colour, Few, FieldPath, Inertia, Length, OnAxes, OneOf, Text, Turns, quantity
 
 
 class SolidTable(Coloured):
@@ -40,9 +27,9 @@ class SolidTable(Coloured):
 
     name: Text
     """Name of the solid."""
-    position: tuple[Length, ...] | None = None
+    position: OnAxes[Length] = None
     """(d,) Position of the centroid [m]; if left out, the shape's corners, centre or mesh determine it."""
-    rotation: Rotation | None = None
+    rotation: Turns[Angle] = None
     """Initial rotation about the centroid [rad]; no rotation if left out. In 3-D a rotation vector, in 2-D one number,
     counterclockwise."""
     motion: Literal["fixed", "path", "free"] = "fixed"
@@ -52,9 +39,9 @@ class SolidTable(Coloured):
     """Density of a free body [kg/m³]: its mass divided by its volume."""
     mass: Annotated[float, quantity("kg", gt=0.0)] | None = None
     """Mass of a free body, in place of its density [kg]; in 2-D the mass per metre of depth."""
-    centre_of_mass: tuple[Length, ...] | None = None
+    centre_of_mass: OnAxes[Length] = None
     """(d,) Vector from the centroid of a free body to its centre of mass, in the body's frame [m]; 0 if left out."""
-    gyration_radius: Radii | None = None
+    gyration_radius: Turns[Annotated[float, quantity("m", gt=0.0)]] = None
     """(3,) Radii of gyration of a free body about the axes of its frame [m], in 2-D one number. A radius of gyration is
     the square root of moment of inertia divided by mass. If left out, the body is homogeneous."""
     inertia: Inertia | None = None
@@ -74,7 +61,7 @@ class SolidTable(Coloured):
     """(k,) Times of the path, increasing from 0 [s]. After the last time the solid is at rest."""
     positions: tuple[tuple[Length, ...], ...] | None = None
     """(k, d) Positions of the centroid at `times` [m]. The first position is the initial position."""
-    rotations: tuple[Rotation, ...] | None = None
+    rotations: tuple[Few[Angle], ...] | None = None
     """(k, 3) Rotation vectors since the start at `times`, in 2-D angles (k,) [rad]. The first rotation is 0."""
     path: File | None = None
     """A CSV file in place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg]. In 3-D the
@@ -86,13 +73,13 @@ class SolidTable(Coloured):
     ramp: Ramp | None = None
     """Duration of the ramp [s]. During the ramp, the displacement is multiplied by a factor that grows smoothly (C2)
     from 0 to 1."""
-    velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
+    velocity: OnAxes[Annotated[float, quantity("m/s")]] = None
     """(d,) Constant velocity of the solid's middle [m/s]; for a free body, the initial velocity of its centre
     of mass."""
-    angular_velocity: Turning | None = None
+    angular_velocity: Turns[Annotated[float, quantity("rad/s")]] = None
     """Constant angular velocity about the solid's middle [rad/s]; for a free body, the initial angular velocity. In 3-D
     a vector, in 2-D one number, counterclockwise."""
-    surface_velocity: tuple[Annotated[float, quantity("m/s")], ...] | None = None
+    surface_velocity: OnAxes[Annotated[float, quantity("m/s")]] = None
     """(d,) Velocity of the sliding surface of a solid at rest, such as a conveyor belt, in the solid's frame [m/s]."""
     side: Literal["outside", "inside"] = "outside"
     """Side of the shape for fluid: "outside", or "inside" for a tank."""
@@ -189,19 +176,13 @@ class SolidTable(Coloured):
         return rotation_matrix(self.rotation or (0.0,) * (2 * dimension - 3))
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        self.check_components(("position", "velocity", "surface_velocity", "centre_of_mass"), dimension, path)
-        self._check_turns(("rotation", "angular_velocity", "gyration_radius"), dimension, path)
-        check_motion(self, dimension, path)
-        return super().in_dimension(dimension, path)
+        placed = super().in_dimension(dimension, path)
+        check_motion(placed, dimension, path)
+        return placed
 
 
 def thick(tables: Sequence[SolidTable]) -> tuple[SolidTable, ...]:
     return tuple(table for table in tables if not table.is_sheet)
-
-
-def check_free_body(path: FieldPath, name: str, tables: Sequence[SolidTable]) -> None:
-    free = [table.name for table in tables if table.motion == "free"]
-    check_name(path, name, free, "a free body", 'of a solid whose motion is "free"')
 
 
 def solids_of(tables: tuple[SolidTable, ...]) -> tuple[Solid, ...]:

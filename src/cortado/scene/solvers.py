@@ -14,7 +14,6 @@ OWN = ("projection", "pcisph")
 """Cortado's kinds of solvers. The first is the default."""
 COURANT = 0.2
 """Default Courant number."""
-
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]
 """Names of tables with default values for their keys."""
 

@@ -37,58 +37,41 @@ def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arra
     elsewhere = {name(one.name) for one in moving(scene.solid) for name in (position_name, rotation_name, scale_name)}
     if len(gravity) > 1 or (gravity[0] * around).any() or stirred or solid.motion == "free" or elsewhere & {*values}:
         return whole
-    lower, upper = _extent(scene)
-    foot = np.clip(solid.solid().extent(), lower, upper)
-    highest = min((np.minimum(*(gravity[0] * np.array(ends))).sum() for ends in _begins(scene, values)), default=-inf)
+    spacing, places = scene.discretisation.spacing, values.get("initial_positions")
+    if places is not None and len(places):
+        extents = [(places.min(axis=0), places.max(axis=0))]
+    else:
+        extents = [fluid.extent(spacing) for fluid in scene.fluid]
+    boxes = [(lower - 0.5 * spacing, upper + 0.5 * spacing) for lower, upper in extents]
+    boxes += [body.extent() for body in solids_of(tuple(free(scene.solid)))]
+    openings = [emitter.opening(spacing) for emitter in scene.emitter]
+    boxes += [(opening.min(axis=0), opening.max(axis=0)) for opening in openings]
+    highest = min((np.minimum(*(gravity[0] * np.array(ends))).sum() for ends in boxes), default=-inf)
+    foot = np.clip(solid.solid().extent(), *_extent(scene))
     return float(np.clip(np.maximum(*(gravity[0] * foot)).sum() - highest, 0.0, whole))
 
 
-def _begins(scene: SceneTables, values: Arrays) -> list[tuple[Points, Points]]:
-    spacing = scene.discretisation.spacing
-    places = values.get("initial_positions")
-    extents = [fluid.extent(spacing) for fluid in scene.fluid]
-    if places is not None and len(places):
-        extents = [(places.min(axis=0), places.max(axis=0))]
-    boxes = [(lower - 0.5 * spacing, upper + 0.5 * spacing) for lower, upper in extents]
-    boxes += [solid.extent() for solid in solids_of(tuple(free(scene.solid)))]
-    openings = [emitter.opening(spacing) for emitter in scene.emitter]
-    return boxes + [(opening.min(axis=0), opening.max(axis=0)) for opening in openings]
-
-
 def _extent(scene: SceneTables) -> tuple[Points, Points]:
-    lower, upper = _room(scene)
-    outlets = np.array([lower, upper, *(emitter.outlet for emitter in scene.emitter)])
-    return outlets.min(axis=0), outlets.max(axis=0)
-
-
-def _room(scene: SceneTables) -> tuple[Points, Points]:
-    ends = scene.container.extent()
+    outlets = [(np.array(emitter.outlet),) * 2 for emitter in scene.emitter]
+    ends, spacing = scene.container.extent(), scene.discretisation.spacing
     if ends is not None:
-        return ends
-    half = 0.5 * scene.discretisation.spacing
-    fluids = np.array([fluid.extent(scene.discretisation.spacing) for fluid in scene.fluid])
-    boxes = [(lower - half, upper + half) for lower, upper in fluids]
-    boxes += [solid.extent() for solid in solids_of(scene.solid)]
-    if not boxes:
-        boxes = [(np.array(emitter.outlet), np.array(emitter.outlet)) for emitter in scene.emitter]
-    lower, upper = np.swapaxes(boxes, 0, 1)
+        boxes = [ends]
+    else:
+        fluids = [fluid.extent(spacing) for fluid in scene.fluid]
+        boxes = [(lower - 0.5 * spacing, upper + 0.5 * spacing) for lower, upper in fluids]
+        boxes += [solid.extent() for solid in solids_of(scene.solid)]
+    lower, upper = np.swapaxes([*boxes, *outlets], 0, 1)
     return lower.min(axis=0), upper.max(axis=0)
 
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
 """Function for the greatest viscous rate on a lattice, and safety factor of the time step, for each form of the viscous
 force."""
-
-
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
 """Factors of the time step limit for deep fluid, by smoothing kernel."""
-
-
 RESTING, RUNNING = 0.63, 0.4
 """Factors of the time step limit for deep fluid with a coarse pressure grid. The first factor is for fluid that covers
 the floor of its container."""
-
-
 SOLID_STEP = 0.2
 """Greatest motion of a solid in a time step [spacings]."""
 FRICTION_STEP = 0.25
@@ -162,11 +145,22 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     and schedule. If gravity changes, its strongest value is used.
     """
     values = values or {}
-    gravity, first = np.atleast_2d(values.get("gravity", _gravity(scene))), _first_speed(scene, values)
-    speed = first + sqrt(2.0 * greatest_fall(scene, gravity))
-    courant = 0.4 * scene.discretisation.support_radius / speed if speed > 0.0 else inf
-    beside = {"solids": _beside_solids(scene, first, gravity, values)} if scene.solid and speed > 0.0 else {}
-    return {"speed": courant, **beside, **standing_limits(scene, values, scene.solid)}
+    gravity, spacing = np.atleast_2d(values.get("gravity", _gravity(scene))), scene.discretisation.spacing
+    if "initial_velocities" in values:
+        first = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
+    else:
+        first = max((fluid.greatest_speed(spacing) for fluid in scene.fluid), default=0.0)
+    for emitter in scene.emitter:
+        flow = float(np.max(values.get(flow_name(emitter.name), emitter.greatest)))
+        first = max(first, flow / emitter.area(spacing))
+    speed, found = first + sqrt(2.0 * greatest_fall(scene, gravity)), {"speed": inf}
+    if speed > 0.0:
+        found["speed"] = 0.4 * scene.discretisation.support_radius / speed
+    for solid in scene.solid if speed > 0.0 else ():
+        beside = first + sqrt(2.0 * fall_to(scene, solid, gravity, values))
+        way = min(THROUGH * solid.thinnest(spacing), BESIDE * spacing) if solid.side == "outside" else inf
+        found["solids"] = min(found.get("solids", inf), way / beside if beside > 0.0 else inf)
+    return {**found, **standing_limits(scene, values, scene.solid)}
 
 
 def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
@@ -187,21 +181,32 @@ def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTa
 
 def gravity_limits(scene: SceneTables, gravity: Points) -> dict[str, Points]:
     """Return the stability limits (k,) [s] that depend on gravity (k, d) [m/s2]."""
-    strength = np.linalg.norm(gravity, axis=1)
+    cut, acts, depth = scene.discretisation, gravity.any(axis=1), np.full(len(gravity), inf)
     with np.errstate(divide="ignore"):
-        force = 0.25 * np.sqrt(scene.discretisation.support_radius / strength)
-    return {"gravity": force, "depth": _depth_limits(scene, gravity)}
+        force = 0.25 * np.sqrt(cut.support_radius / np.linalg.norm(gravity, axis=1))
+    if not scene.forces.pressure or not acts.any() or not scene.fluid:
+        return {"gravity": force, "depth": depth}
+    pulls, lengths, ends = np.abs(gravity[acts]), fluid_lengths(scene), scene.container.extent()
+    along, axes = pulls * lengths, pulls.argmax(axis=1)
+    upright = np.take_along_axis(along, axes[:, None], axis=1)[:, 0]
+    roots = np.sqrt(np.linalg.norm(pulls, axis=1))
+    depths = 0.5 * (upright + along.sum(axis=1)) / roots  # times sqrt(|g|)
+    if isinstance(scene.solver, ProjectionSolver):
+        covers_floor = np.zeros(len(axes), dtype=bool)
+        if ends is not None:
+            gaps = ends[1] - ends[0] - lengths > cut.spacing
+            covers_floor = gaps.sum() == gaps[axes]
+        depth[acts] = np.where(covers_floor, RESTING, RUNNING) * cut.spacing / np.sqrt(depths * roots)
+    else:
+        depth[acts] = DEPTH_FACTORS[cut.kernel] * 0.5 * cut.support * cut.spacing**1.5 / depths
+    return {"gravity": force, "depth": depth}
 
 
 def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
     gravity = np.atleast_2d(values.get("gravity", _gravity(scene)))
     of_gravity = {name: float(limits.min()) for name, limits in gravity_limits(scene, gravity).items()}
-    optional = {
-        p.name.replace("_", " "): p.longest_step(scene, values)
-        for p in PARAMETERS
-        if p.is_optional and p.present(scene)
-    }
-    return {**of_gravity, **optional}
+    optional = [p for p in PARAMETERS if p.is_optional and p.present(scene)]
+    return {**of_gravity, **{p.name.replace("_", " "): p.longest_step(scene, values) for p in optional}}
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
@@ -221,18 +226,6 @@ def _gravity(scene: SceneTables) -> Points:
     if "tilt" in courses:
         return Tilt(scene.forces.gravity).gravity(courses["tilt"].seen)
     return courses["gravity"].seen if "gravity" in courses else np.array(scene.forces.gravity)
-
-
-def _first_speed(scene: SceneTables, values: Arrays) -> float:
-    if "initial_velocities" in values:
-        speed = float(np.linalg.norm(values["initial_velocities"], axis=1).max())
-    else:
-        spacing = scene.discretisation.spacing
-        speed = max((fluid.greatest_speed(spacing) for fluid in scene.fluid), default=0.0)
-    for emitter in scene.emitter:
-        flow = float(np.max(values.get(flow_name(emitter.name), emitter.greatest)))
-        speed = max(speed, flow / emitter.area(scene.discretisation.spacing))
-    return speed
 
 
 def viscous_limit(scene: SceneTables, values: Arrays) -> float:
@@ -258,56 +251,14 @@ def _kinematic(scene: SceneTables, values: Arrays) -> float:
     return max(thickest) / float(densities[used].min())
 
 
-def _beside_solids(scene: SceneTables, first: float, gravity: Points, values: Arrays) -> float:
-    """Return the longest time step [s] for fluid beside solids, with the initial speed ``first`` [m/s]."""
-    spacing, found = scene.discretisation.spacing, [inf]
-    for solid in scene.solid:
-        speed = first + sqrt(2.0 * fall_to(scene, solid, gravity, values))
-        if solid.side == "outside" and speed > 0.0:
-            found.append(min(THROUGH * solid.thinnest(spacing), BESIDE * spacing) / speed)
-    return min(found)
-
-
-def _depth_limits(scene: SceneTables, gravity: Points) -> Points:
-    """Return the time step limits (k,) [s] from the depth of the fluid, for gravity (k, d) [m/s2]."""
-    limits = np.full(len(gravity), inf)
-    acts = gravity.any(axis=1)
-    if not scene.forces.pressure or not acts.any() or not scene.fluid:
-        return limits
-    cut = scene.discretisation
-    pulls = np.abs(gravity[acts])
-    along = pulls * fluid_lengths(scene)
-    upright = np.take_along_axis(along, pulls.argmax(axis=1)[:, None], axis=1)[:, 0]
-    roots = np.sqrt(np.linalg.norm(pulls, axis=1))
-    depths = 0.5 * (upright + along.sum(axis=1)) / roots  # times sqrt(|g|)
-    if isinstance(scene.solver, ProjectionSolver):
-        factors = np.where(_covers_floor(scene, pulls.argmax(axis=1)), RESTING, RUNNING)
-        limits[acts] = factors * cut.spacing / np.sqrt(depths * roots)
-    else:
-        limits[acts] = DEPTH_FACTORS[cut.kernel] * 0.5 * cut.support * cut.spacing**1.5 / depths
-    return limits
-
-
-def _covers_floor(scene: SceneTables, upright: Points) -> Points:
-    """Test if the fluid covers the floor of the container, for each vertical axis in ``upright`` (k,)."""
-    ends = scene.container.extent()
-    if ends is None:
-        return np.zeros(len(upright), dtype=bool)
-    gaps = (ends[1] - ends[0] - fluid_lengths(scene)) > scene.discretisation.spacing
-    return gaps.sum() == gaps[upright]
-
-
 def fluid_lengths(scene: SceneTables) -> Points:
     """Return the length of the initial fluid along each axis (d,) [m], without empty gaps."""
     spacing = scene.discretisation.spacing
     extents = np.array([fluid.extent(spacing) for fluid in scene.fluid])
-    return np.array([_covered(extents[:, :, axis], spacing) for axis in range(scene.dimension)])
-
-
-def _covered(ends: Points, spacing: float) -> float:
-    total, reached = 0.0, -inf
-    for lower, upper in ends[np.argsort(ends[:, 0])]:
-        lower, upper = lower - 0.5 * spacing, upper + 0.5 * spacing
-        total += max(upper - max(lower, reached), 0.0)
-        reached = max(reached, upper)
-    return total
+    found = np.zeros(scene.dimension)
+    for axis in range(scene.dimension):
+        ends, reached = extents[:, :, axis], -inf
+        for lower, upper in ends[np.argsort(ends[:, 0])] + [-0.5 * spacing, 0.5 * spacing]:
+            found[axis] += max(upper - max(lower, reached), 0.0)
+            reached = max(reached, upper)
+    return found

@@ -7,6 +7,7 @@ descriptions in the schema.
 
 import ast
 import inspect
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,17 +18,8 @@ from sys import modules
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic.annotated_handlers import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
@@ -107,7 +99,7 @@ class OrWord:
 
 
 Item = TypeVar("Item")
-PER_AXIS = "per axis"
+PER_AXIS, PER_ROTATION = "per axis", "per rotation"
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
 """A vector with one entry for each axis. In 2-D the default is the first two entries of the default in 3-D."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
@@ -127,6 +119,15 @@ def without_numpy(value: Any) -> Any:
 Angle = Annotated[float, quantity("rad")]
 
 
+def _not_zero(vector: tuple[float, ...]) -> tuple[float, ...]:
+    if math.hypot(*vector) < 1.0 / GREATEST:
+        raise field_error((), vector, "a vector that is not zero")
+    return vector
+
+
+Direction = Annotated[Vector[Annotated[float, quantity()]], AfterValidator(_not_zero)]
+
+
 def _in_a_list(value: Any) -> Any:
     return [value] if isinstance(value, (int, float)) else value
 
@@ -137,19 +138,9 @@ def _few(most: int) -> Any:
 
 
 Few = Annotated[tuple[Item, ...], _few(3), BeforeValidator(_in_a_list)]
-Rotation = Few[Angle]
-Turning = Few[Annotated[float, quantity("rad/s")]]
-Radii = Few[Annotated[float, quantity("m", gt=0.0)]]
+OnAxes = Annotated[tuple[Item, ...] | None, PER_AXIS]
+Turns = Annotated[Few[Item] | None, PER_ROTATION]
 Inertia = Annotated[tuple[Annotated[float, quantity("kg m2")], ...], _few(9), BeforeValidator(_in_a_list)]
-
-
-def rotation_matrix(rotation: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return the matrix (d, d) of a rotation vector (3,) in 3-D or an angle (1,) in 2-D [rad]."""
-    from scipy.spatial.transform import Rotation as Turn
-
-    if len(rotation) == 1:
-        return np.asarray(Turn.from_rotvec([0.0, 0.0, rotation[0]]).as_matrix()[:2, :2])
-    return np.asarray(Turn.from_rotvec(rotation).as_matrix())
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
@@ -220,35 +211,34 @@ def _scene_error(error: ValidationError, model: type[BaseModel]) -> SceneError:
     if first["type"] == "scene":
         own = first["ctx"]["error"]
         path, sentence = [*path, *own.path], own.sentence
-        if own.found is UNKNOWN and (homes := _homes(whole, path)):
-            sentence = f"is not a key of {{table}}; did you mean {' or '.join(homes)}?"
+        if own.found is UNKNOWN:
+            key, here = path[-1], tuple(part for part in path if not isinstance(part, int))
+            homes = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != here]
+            words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in homes]
+            if 0 < len(words) <= MOST_HOMES:
+                sentence = f"is not a key of {{table}}; did you mean {' or '.join(words)}?"
         if sentence:
             sentence = sentence.replace("{table}", f"[{field_name(path[:-1])}]" if path[1:] else "the scene")
         return SceneError(None, field_name(path), own.found, own.wanted, sentence)
-    found, words = first["input"], wanted(schema, field_name(path[-1:]))
+    found, valid = first["input"], wanted(schema, field_name(path[-1:]))
     if first["type"] == "missing":
         found = MISSING
     elif "discriminator" in schema and isinstance(found, Mapping):
         union = schema["discriminator"]
         path, found = [*path, union["propertyName"]], found.get(union["propertyName"], MISSING)
-        words = any_of(union["mapping"])
+        valid = any_of(union["mapping"])
     elif first["type"] in ("float_type", "finite_number"):
-        words = f"a finite number{'' if words.startswith('a ') else f', {words}'}"
-    elif first["type"] in ("less_than_equal", "greater_than_equal") and _is_out_of_size(found, schema):
-        words = f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size"
-    return SceneError(None, field_name(path), found, words)
+        valid = f"a finite number{'' if valid.startswith('a ') else f', {valid}'}"
+    elif first["type"].endswith("_than_equal") and schema["type"] == "number":
+        is_tiny = 0.0 < found < schema["minimum"] == 1.0 / GREATEST
+        if is_tiny or abs(found) > GREATEST:
+            valid = f"a number between {1.0 / GREATEST:g} and {GREATEST:g} in size"
+    return SceneError(None, field_name(path), found, valid)
 
 
 @cache
 def _schema_of(model: type[BaseModel]) -> Schema:
     return model.model_json_schema()
-
-
-def _homes(whole: Schema, path: FieldPath) -> list[str]:
-    key, own = path[-1], tuple(part for part in path if not isinstance(part, int))
-    found = [home for home in dict.fromkeys(_fields(whole, whole, ())) if home[-1] == key and home != own]
-    words = [field_name(home) if len(home) > 1 else f"{key} at the top of the file" for home in found]
-    return words if len(words) <= MOST_HOMES else []
 
 
 def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]:
@@ -260,11 +250,6 @@ def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]
     members = [one for kind in ("anyOf", "oneOf", "allOf") for one in part.get(kind, ())]
     for member in [*members, *([part["items"]] if "items" in part else [])]:
         yield from _fields(whole, member, path)
-
-
-def _is_out_of_size(number: float, schema: Schema) -> bool:
-    tiny = 0.0 < number < schema["minimum"] == 1.0 / GREATEST
-    return schema["type"] == "number" and (tiny or abs(number) > GREATEST)
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
@@ -318,6 +303,8 @@ class Table(BaseModel, metaclass=Documented):
     model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
     """Tables of other modules that a file may contain."""
+    _instead: ClassVar[Mapping[int, str]] = {}
+    """Names of the shapes to use in 2 or 3 dimensions in place of a shape that does not exist there."""
 
     def __init__(self, /, **data: Any):
         with sentences(type(self)):
@@ -356,11 +343,19 @@ class Table(BaseModel, metaclass=Documented):
         return schema
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
-        """Return the table for 2 or 3 dimensions, after a check of its vectors."""
-        vectors = [name for name, field in type(self).model_fields.items() if PER_AXIS in field.metadata]
+        """Return the table for 2 or 3 dimensions, after a check of its shape, vectors and rotations."""
+        if dimension in self._instead:
+            found = getattr(self, "shape", None)
+            raise field_error((*path, "shape"), found, f"{self._instead[dimension]} in {dimension}-D")
+        marks = {name: field.metadata for name, field in type(self).model_fields.items()}
+        vectors = [name for name in marks if PER_AXIS in marks[name] and getattr(self, name) is not None]
         defaults = {name: getattr(self, name)[:dimension] for name in vectors if name not in self.model_fields_set}
         placed = self.model_copy(update=defaults)
         placed.check_components(vectors, dimension, path)
+        for name in [name for name in marks if PER_ROTATION in marks[name]]:
+            if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
+                wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
+                raise field_error((*path, name), value, wanted)
         return placed
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
@@ -369,13 +364,6 @@ class Table(BaseModel, metaclass=Documented):
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
                 wanted = f"a list of {dimension} components, as the scene has {dimension} dimensions"
-                raise field_error((*path, name), value, wanted)
-
-    def _check_turns(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` if a rotation or an angular velocity does not have 1 component in 2-D or 3 in 3-D."""
-        for name in names:
-            if (value := getattr(self, name)) is not None and len(value) != 2 * dimension - 3:
-                wanted = "one number in 2-D" if dimension == 2 else "a list of 3 components in 3-D"
                 raise field_error((*path, name), value, wanted)
 
 
