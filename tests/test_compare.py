@@ -15,7 +15,6 @@ from cortado.cli import main
 
 @pytest.fixture(scope="module")
 def first(tmp_path_factory):
-    """A run of a scene, and the scene."""
     folder = tmp_path_factory.mktemp("first")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -33,7 +32,6 @@ def runs(first, tmp_path, monkeypatch, unrendered):
 
 
 def run(out, *options):
-    """Without pictures, which nobody compares."""
     main(["run", "scene.toml", "--steps", "4", "--out", out, "--quiet", "--no-pictures", *options])
 
 
@@ -72,14 +70,12 @@ def test_differences_are_numbers_with_units(capsys):
     assert out.endswith("The two runs differ.\n")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "part"), [('"version_of_nothing": 1', "", ""), ('"cortado": "', '"cortado": "9', "environment")]
-)
-def test_another_machine_is_told_but_is_no_difference(capsys, old, new, part):
+def test_another_machine_is_told_but_is_no_difference(capsys):
+    assert not compared(capsys, "one", "other")["environment"]
     file = Path("other/environment.json")
-    file.write_text(file.read_text().replace(old, new))
+    file.write_text(file.read_text().replace('"cortado": "', '"cortado": "9'))
     found = compared(capsys, "one", "other")
-    assert found["equal"] is True and bool(found["environment"]) == bool(part)
+    assert found["equal"] is True and found["environment"]
 
 
 def test_other_sizes_cannot_be_compared_one_by_one(capsys):
@@ -113,26 +109,21 @@ def test_searches_can_be_compared_too(capsys):
     assert "kind: 'optimise' | 'run'" in said(capsys, "a", "one")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["one"], "RUN|DATA.csv is missing"),
-        (["one", "absent"], "There is no run in "),
-        (["one", "."], "There is no run in "),
-        (["scene.toml", "one"], "There is no run in "),
-        (["one", "damaged"], "cannot be read"),
-        (["one", "torn"], "torn"),
-    ],
-)
-def test_mistakes_are_sentences(capsys, arguments, words):
+def test_mistakes_are_sentences(capsys):
     for name, file, text in (("damaged", "scene.json", "{"), ("torn", "trajectory.vtkhdf", "nothing")):
         shutil.copytree("one", name)
         Path(name, file).write_text(text)
-    with pytest.raises(SystemExit, match="2"):
-        main(["compare", *arguments])
-    out, err = capsys.readouterr()
-    assert_one_sentence(err.removesuffix("\n"))
-    assert out == "" and words in err
+    for arguments, words in [
+        (["one"], "RUN|DATA.csv is missing"),
+        (["one", "absent"], "There is no run in "),
+        (["one", "damaged"], "cannot be read"),
+        (["one", "torn"], "torn"),
+    ]:
+        with pytest.raises(SystemExit, match="2"):
+            main(["compare", *arguments])
+        out, err = capsys.readouterr()
+        assert_one_sentence(err.removesuffix("\n"))
+        assert out == "" and words in err
 
 
 # ---- times -------------------------------------------------------------------------------------------------------
@@ -170,13 +161,6 @@ def test_runs_without_a_common_time_are_not_compared(capsys):
     assert not found["last_state"]["fields"] and "different times" in found["last_state"]["unlike"]
     assert found["equal"] is False
     assert "last state at 0.0084 s | 0.0039 s: these are different times" in said(capsys, "one", "other_times")
-
-
-def test_as_many_steps_of_other_lengths_may_end_at_the_same_time(capsys):
-    run("halved", "--steps", "8", "--set", "solver.time_step=0.00105")
-    state = compared(capsys, "one", "halved")["last_state"]
-    assert state["compared_at_s"] == pytest.approx(0.0084) and state["fields"]["positions"]["greatest"] > 0.0
-    assert "last state at 0.0084 s: positions apart by" in said(capsys, "one", "halved")
 
 
 def test_a_run_that_lacks_its_last_frame_differs_by_it_alone(capsys):

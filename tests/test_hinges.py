@@ -32,7 +32,6 @@ def pendulum(angle, time_step=0.001, dimension=2, **hinge):
 
 
 def swing(scene, steps):
-    """Times [s], angles [rad], angular velocities and positions of the rod."""
     run = Simulation(scene, precision="float64").run(steps, record_every=1)
     solid, d = run.solids["rod"], scene.dimension
     angles, spins = (a if d == 2 else a[:, 2] for a in (solid.rotations, solid.angular_velocities))
@@ -168,7 +167,6 @@ def test_bodies_on_a_hinge_to_each_other_keep_their_momenta(scene_of):
 
 
 WRONG = {
-    "itself": ({"to": "raft"}, {}, r"hinge\[0\]\.to is 'raft', but must be left out, for the world"),
     "nobody": ({"to": "boat"}, {}, r"hinge\[0\]\.to is 'boat', but must be left out, for the world"),
     "a speed alone": (
         {"speed": 1.0},
@@ -178,19 +176,18 @@ WRONG = {
     "no solid": ({"solid": "boat"}, {}, r"hinge\[0\]\.solid is 'boat', but must be the name of a free body"),
     "a path": ({}, {"motion": "path", "velocity": [0.0, 0.1], "density": None}, "of a solid whose motion is"),
     "an axis": ({"axis": [0.0, 0.0, 1.0]}, {}, r"hinge\[0\]\.axis is .* left out in 2-D"),
-    "a place in space": ({"position": [0.2, 0.5, 0.0]}, {}, r"hinge\[0\]\.position"),
     "freedoms": ({}, {"freedom": ["y"]}, r"solid\[0\]\.freedom is given, but must be left out, as the solid is on the"),
     "a velocity": ({}, {"velocity": [0.0, 1.0]}, r"solid\[0\]\.velocity is given, but must be left out"),
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_hinges_that_hold_nothing_are_a_sentence(name):
-    hinge, body, sentence = WRONG[name]
-    table = {**RAFT, "velocity": None, "angular_velocity": None, **body}
-    table = {key: value for key, value in table.items() if value is not None}
-    with pytest.raises(SceneError, match=sentence):
-        plane(table, hinge=[{"name": "pin", "solid": "raft", "position": [0.22, 0.5], **hinge}])
+def test_hinges_that_hold_nothing_are_a_sentence():
+    for name in WRONG:
+        hinge, body, sentence = WRONG[name]
+        table = {**RAFT, "velocity": None, "angular_velocity": None, **body}
+        table = {key: value for key, value in table.items() if value is not None}
+        with pytest.raises(SceneError, match=sentence):
+            plane(table, hinge=[{"name": "pin", "solid": "raft", "position": [0.22, 0.5], **hinge}])
 
 
 def test_rings_of_hinges_and_rubbed_bodies_on_them_are_a_sentence():

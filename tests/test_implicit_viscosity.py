@@ -4,20 +4,11 @@ import numpy as np
 import pytest
 
 from cortado import CortadoWarning, Problem, Simulation, losses
-from cortado.cli import main
 from cortado.scene.stability import is_implicit, stability_limits, viscous_limit
 from cortado.sph.viscous_stress import ImplicitViscousStress
 from scenes import HONEY, box, plane, scene
 
 STEPS = 6
-TEXT = """
-dimension = 2
-phase = [{{ name = "honey", rest_density = 1400.0, viscosity = 10.0 }}]
-fluid = [{{ shape = "box", lower = [0.0, 0.0], upper = [0.2, 0.2], phase = "honey" }}]
-discretisation = {{ spacing = 0.05 }}
-forces = {{ viscous_solve = "{solve}" }}
-solver = {{ time_step = 0.001 }}
-"""
 FLUID = box([0.0, 0.0], [0.3, 0.4], velocity=[0.5, 0.2], phase="honey")
 ROOM = box([0.0, 0.0], [0.6, 0.6], slip="no")
 SOLVER = {"kind": "pcisph", "time_step": 0.002, "minimum_iterations": 3, "maximum_iterations": 3}
@@ -63,14 +54,6 @@ def test_it_is_chosen_where_the_time_step_is_too_long():
     forces = Simulation(thick("automatic", 1.1 * limit)).solver.forces
     assert isinstance(forces[-1], ImplicitViscousStress)
     assert not any(isinstance(one, ImplicitViscousStress) for one in Simulation(thick("explicit")).solver.forces)
-
-
-def test_describe_says_which_is_chosen_and_why(tmp_path, capsys):
-    file = tmp_path / "thick.toml"
-    for solve, words in (("implicit", "implicit, at the end of a step; "), ("explicit", "explicit, at the start of a")):
-        file.write_text(TEXT.format(solve=solve))
-        main(["describe", str(file), "--set", "picture.film_frames=0"])
-        assert f"stress, {words}" in " ".join(capsys.readouterr().out.split())
 
 
 def test_it_comes_to_the_explicit_flow_with_the_first_order_of_the_time_step():

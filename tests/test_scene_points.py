@@ -45,13 +45,11 @@ def test_positions_are_read_from_vtk(tmp_path, suffix, writer):
 
 
 def drop(file):
-    """A scene in the plane whose fluid is where a file says."""
     return Scene(**plane(fluid=[{"shape": "points", "file": str(file), "phase": "water"}]))
 
 
-@pytest.mark.parametrize(
-    "array, trouble",
-    [
+def test_bad_positions_are_a_sentence(tmp_path):
+    for array, trouble in [
         (np.zeros(3), "shape"),
         (np.zeros((4, 3)), "shape"),
         (np.zeros((0, 2)), "cannot be used"),
@@ -61,24 +59,21 @@ def drop(file):
         (np.zeros((1000, 2)), "overlapping itself"),
         (np.array([[0.0, 0.0], [0.0, 0.04], [0.0, 1.0]]), "overlapping itself"),
         (np.array([[0.0, 1e20]]), "origin"),
-    ],
-)
-def test_bad_positions_are_a_sentence(tmp_path, array, trouble):
-    np.save(tmp_path / "bad.npy", array)
-    with one_sentence(trouble, error=SceneError):
-        drop(tmp_path / "bad.npy")
+    ]:
+        np.save(tmp_path / "bad.npy", array)
+        with one_sentence(trouble, error=SceneError):
+            drop(tmp_path / "bad.npy")
 
 
-@pytest.mark.parametrize("name", ["bad.npy", "bad.vtk", "bad.vtp", "bad.vtkhdf"])
-def test_files_of_rubbish_are_a_sentence(tmp_path, name, capfd):
-    (tmp_path / name).write_bytes(b"rubbish\n\x00\xff")
-    with one_sentence("cannot be used", error=SceneError):
-        drop(tmp_path / name)
-    assert capfd.readouterr().err == ""
+def test_files_of_rubbish_are_a_sentence(tmp_path, capfd):
+    for name in ["bad.npy", "bad.vtk", "bad.vtp", "bad.vtkhdf"]:
+        (tmp_path / name).write_bytes(b"rubbish\n\x00\xff")
+        with one_sentence("cannot be used", error=SceneError):
+            drop(tmp_path / name)
+        assert capfd.readouterr().err == ""
 
 
 def npy(header: str, numbers: int = 2) -> bytes:
-    """A file of NumPy's with that header, and so many numbers of 8 bytes."""
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + bytes(8 * numbers)
 
 
@@ -90,21 +85,14 @@ def header(shape: str, kind: str = "'<f8'") -> str:
     "content, words",
     [
         (npy(header("(5, 2)")), r"says that it holds float64 of shape \(5, 2\), which takes 147 bytes, but it has 83"),
-        (npy(header("(1, 2)"), 200), "which takes 83 bytes, but it has 1667"),
         (npy(header("(1000000000000, 2)")), "holds 1000000000000 points, but must hold at most"),
         (npy(header("(-1, 2)")), r"shape \(-1, 2\), but must hold numbers of shape \(n, 2\)"),
-        (npy(header("(-1, -2)")), "but must hold numbers"),
         (npy(header("(1, 2)", "'<c16'")), "holds complex128"),
-        (npy(header("(1, 2)", "'|O'")), "holds object"),
         (npy(header("(1, 2)", "[('x', '<f8')]")), "but must hold numbers"),
-        (npy(header("(1,)", "('<f8', (2,))")), "but must hold numbers"),
         (npy(header("(1, 2)", "'\\q'")), "no array that NumPy can read"),
         (npy("[" * 60_000), "no array that NumPy can read"),
-        (npy("(" * 9_000), "no array that NumPy can read"),
         (npy("-" * 9_000 + "1"), "no array that NumPy can read"),
-        (b"PK\x03\x04" + bytes(100), "no array that NumPy can read"),
         (b"\x93NUMPY\x02\x00\xff\xff\xff\xff{", "no array that NumPy can read"),
-        (b"\x93NUMPY\x09\x00", "no array that NumPy can read"),
         (b"", "no array that NumPy can read"),
     ],
 )
@@ -128,21 +116,18 @@ POLY_DATA = """<VTKFile type="PolyData" version="1.0"><PolyData><Piece NumberOfP
 """
 
 
-@pytest.mark.parametrize(
-    "name, content",
-    [
+def test_what_ends_vtk_is_a_sentence(tmp_path, capfd):
+    """Some of these take the process with them that reads them."""
+    for name, content in [
         ("much.vtp", POLY_DATA.encode()),
         ("much.vtk", LEGACY + b"POINTS 100000000000 double\n1 2 3\n"),
         ("bytes.vtk", LEGACY + b"POINTS 2 \xff\xfe\n1 0 1 0 1 0\n"),
-    ],
-)
-def test_what_ends_vtk_is_a_sentence(tmp_path, name, content, capfd):
-    """Some of these take the process with them that reads them."""
-    pytest.importorskip("vtkmodules")
-    (tmp_path / name).write_bytes(content)
-    with one_sentence("holds no points that"):
-        read_points(str(tmp_path / name), 3)
-    assert capfd.readouterr().err == ""
+    ]:
+        pytest.importorskip("vtkmodules")
+        (tmp_path / name).write_bytes(content)
+        with one_sentence("holds no points that"):
+            read_points(str(tmp_path / name), 3)
+        assert capfd.readouterr().err == ""
 
 
 def test_the_first_frame_of_a_trajectory_is_read_and_a_damaged_one_is_a_sentence(tmp_path, capfd):
@@ -184,28 +169,22 @@ def test_a_file_that_takes_for_ever_is_given_up(tmp_path, monkeypatch):
 DEEP = "a." * 30_000 + "b"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
+def test_a_key_of_very_many_parts_is_refused_at_once(tmp_path):
+    for text in [
         f"{DEEP} = 1",
         f"[{DEEP}]",
         f"x = {{ {DEEP} = 1 }}",
         "'a' . " * 30_000 + "b = 1",
-        '"\\"" .' * 30_000 + "b = 1",
-        f'# """\n{DEEP} = 1\n# """',
         f'y = {{ a = """\n\'""", {DEEP} = 1 }}',
         f'y = {{ a = """x"""", {DEEP} = 1 }}',
-        f"y = {{ a = '''\n\"''', {DEEP} = 1 }}",
-    ],
-)
-def test_a_key_of_very_many_parts_is_refused_at_once(tmp_path, text):
-    path = tmp_path / "deep.toml"
-    path.write_text(text)
-    begin = time.monotonic()
-    with pytest.raises(SceneError, match="has a key of more than 10 parts") as caught:
-        read_toml(path)
-    assert time.monotonic() - begin < 5.0
-    assert_one_sentence(str(caught.value))
+    ]:
+        path = tmp_path / "deep.toml"
+        path.write_text(text)
+        begin = time.monotonic()
+        with pytest.raises(SceneError, match="has a key of more than 10 parts") as caught:
+            read_toml(path)
+        assert time.monotonic() - begin < 5.0
+        assert_one_sentence(str(caught.value))
 
 
 def test_a_mark_of_notepad_is_left_out(tmp_path):
@@ -237,26 +216,23 @@ def test_large_files_and_pipes_are_not_read(tmp_path):
         read_toml(path)
 
 
-@pytest.mark.parametrize("text", ["# 1.2.3.4.5.6.7.8.9.10.11.12", 'x = "1.2.3.4.5.6.7.8.9.10.11.12"', "x = [1.5, 2.5]"])
-def test_dots_elsewhere_are_no_parts(tmp_path, text):
-    (tmp_path / "fine.toml").write_text(text * 2 if text[0] == "#" else text)
-    read_toml(tmp_path / "fine.toml")
+def test_dots_elsewhere_are_no_parts(tmp_path):
+    for text in ["# 1.2.3.4.5.6.7.8.9.10.11.12", 'x = "1.2.3.4.5.6.7.8.9.10.11.12"', "x = [1.5, 2.5]"]:
+        (tmp_path / "fine.toml").write_text(text * 2 if text[0] == "#" else text)
+        read_toml(tmp_path / "fine.toml")
 
 
-@pytest.mark.parametrize(
-    "override, words",
-    [
+def test_hostile_overrides_are_sentences(tmp_path):
+    """And short ones, which do not repeat them."""
+    for override, words in [
         (f"{DEEP}=1", "has a key of more than 10 parts"),
         (f"x={{{DEEP}=1}}", "has a key of more than 10 parts"),
         ("x" + "[0]" * 3000 + "=1", "has a key of more than 10 parts"),
         (f"fluid[{'9' * 5000}].file=1", "an index from 0 to 0"),
         (f"x={'[' * MOST_BYTES}", "an override must have at most 1000000"),
         (".=" + "é" * 5000, "is not an override of the form key=value"),
-    ],
-)
-def test_hostile_overrides_are_sentences(tmp_path, override, words):
-    """And short ones, which do not repeat them."""
-    (tmp_path / "scene.toml").write_text("[[fluid]]")
-    with one_sentence(words, error=SceneError) as caught:
-        read_toml(tmp_path / "scene.toml", [override])
-    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+    ]:
+        (tmp_path / "scene.toml").write_text("[[fluid]]")
+        with one_sentence(words, error=SceneError) as caught:
+            read_toml(tmp_path / "scene.toml", [override])
+        assert len(str(caught.value)) < 300 + len(str(tmp_path))

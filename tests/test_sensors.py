@@ -8,13 +8,10 @@ import pytest
 import cortado
 from bad_tasks import TINY_SCENE
 from cortado.cli import main
-from cortado.cli.describe import measured_speed
 from cortado.discretise.smoothing import KERNELS
 from cortado.errors import CortadoWarning, InputError
 from cortado.losses import Series
-from cortado.losses.distances import SensorMatch
 from cortado.runs.quantity_values import QuantityEvaluator
-from cortado.runs.recording import StepReader, Table
 from cortado.runs.sensor import Readings, SensorLog, as_csv, from_csv, value_of
 from cortado.scene.shape_tables import NoContainer
 from cortado.sensors import FlowRate, PressureProbe, WallForce, WaveGauge
@@ -71,28 +68,6 @@ def test_the_certificate_finds_the_gradient_of_a_sensor_right(name, sensor):
     assert cortado.certify(problem, {"gravity": point["gravity"]}).right
 
 
-@pytest.mark.parametrize(("make", "name", "sensor"), CASES, ids=NAMED)
-def test_what_a_sensor_makes_of_its_adjoint_is_its_derivative(make, name, sensor):
-    """With respect to the fields and quantities that it reads, taken as free."""
-
-    class Fields(dict):
-        dimension, lattice, solids = make().dimension, simulated(make()).lattice, ()
-        container = make().container
-
-    end = cortado.Problem(simulated(make()), 5, SensorMatch(sensor, 0.0)).end({})
-    names = ("positions", "velocities", "pressure", "wall_force")
-    random, at = np.random.default_rng(2), Fields({key: end[key] for key in names})
-    bar = random.normal(size=len(sensor.value(at)))
-    bars = sensor.adjoint(at, bar)
-    along = {key: random.normal(size=value.shape) * np.abs(value).max() * 1e-3 for key, value in at.items()}
-    derivative = sum((bars[key] * along[key]).sum() for key in bars)
-
-    def value(point):
-        return float(bar @ sensor.value(Fields(point)))
-
-    assert distance(value, dict(at), along, derivative, [1e-2, 1e-3, 1e-4, 1e-5], enough=1e-5) < 1e-5
-
-
 FRICTIONLESS = {"viscosity": "none", "gravity": [1.0, -9.81]}
 
 
@@ -140,11 +115,10 @@ class Moving(Basin):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("support", [1.2, 2.0, 3.0])
+@pytest.mark.parametrize("support", [1.2, 3.0])
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("place", [1.0, 1.013])
-def test_a_basin_is_as_deep_as_it_is_with_every_kernel(kernel, support, dimension, place):
-    basin, middle = Moving(dimension, kernel=kernel, support=support), [place, 0.2, 0.987][:dimension]
+def test_a_basin_is_as_deep_as_it_is_with_every_kernel(kernel, support, dimension):
+    basin, middle = Moving(dimension, kernel=kernel, support=support), [1.013, 0.2, 0.987][:dimension]
     assert value_of(WaveGauge(middle), basin)[0] == pytest.approx(0.5, rel=1e-3)
     across = 1.0 if dimension == 2 else 2.0
     flow = value_of(FlowRate(middle, np.eye(dimension)[0]), basin)[0]
@@ -243,7 +217,6 @@ PROBE = PressureProbe([0.2, 0.1])
 
 
 def series_of(sensor, values=(1.0, 2.0), time_step=0.0021, parameters=None, **options):
-    """Its value in a run of the plane."""
     loss = Series(sensor, [0.0, 0.0084], values, time_step, **options)
     return cortado.Problem(cortado.Simulation(plane()), 4, loss).value(parameters or {})
 
@@ -251,68 +224,42 @@ def series_of(sensor, values=(1.0, 2.0), time_step=0.0021, parameters=None, **op
 MISTAKES = [
     (lambda: read_by(sensors=[PROBE]), "sensors is .* but must be a table by name"),
     (lambda: read_by(sensors={"o": Odd(3.0)}), r"sensor Odd has shape \(\), but must be \(1,\)"),
-    (lambda: read_by(sensors={"o": Odd([3.0, 4.0])}), r"Odd has shape \(2,\), but must be"),
     (lambda: read_by(sensors={"o": Odd("deep")}), "sensor Odd is 'deep', but must be"),
-    (lambda: PressureProbe([np.nan, 0.0]), "position is .* but must be numbers"),
-    (lambda: PressureProbe([np.inf, 0.0]), "position is .* but must be finite"),
     (lambda: PressureProbe([0.0, 0.0], np.inf), "radius is inf, but must be greater than 0 and finite"),
-    (lambda: WallForce([np.nan, 0.0]), "lower is .* but must be numbers"),
-    (lambda: Series(PROBE, [0.0, 1.0], ["a", "b"], 0.1), "values is made of text"),
-    (lambda: Series(PROBE, [0.0, 1.0], [[1.0], [1.0, 2.0]], 0.1), "values is .* but must be a number or an array"),
     (lambda: Series(PROBE, [0.0, 1.0], [np.inf, 0.0], 0.1), "values must be finite"),
-    (lambda: Series(PROBE, [0.0, 1.0], [np.nan, np.nan], 0.1), "values must be finite, .* but not all NaN"),
     (lambda: Series(PROBE, [0.0, 1.0], [1.0, 0.0], 0.1, scale=[1.0, 2.0]), r"scale has shape \(2,\), but must be"),
-    (lambda: Series(PressureProbe, [0.0, 1.0], [1.0, 0.0], 0.1), "sensor is .* but must be a sensor, such as"),
     (lambda: series_of(PROBE, [[1.0, 2.0], [3.0, 4.0]]), "values has 2 columns, but must have 1"),
     (lambda: series_of(PROBE, time_step=0.002), "time_step of the series is 0.002 s, but must be .* 0.0021 s"),
-    (lambda: series_of(PROBE, parameters={"time_step": 0.001}), "time_step of the series is 0.0021 s, but must be"),
     (lambda: series_of(Odd(3.0)), r"sensor Odd has shape \(\)"),
-    (lambda: PressureProbe([0.0]), "position has shape"),
-    (lambda: PressureProbe([0.0, 0.0], -1.0), "radius is -1, but must be greater than 0"),
     (lambda: FlowRate([0.0, 0.0], [0.0, 0.0]), "normal is .* but must not be 0"),
     (lambda: WallForce([1.0, 0.0], [0.0, 1.0]), "upper is .* but must be greater than lower"),
     (lambda: Series(PROBE, [0.0, 1.0], [1.0], 0.1), "values has shape"),
     (lambda: Series(PROBE, [1.0, 0.0], [1.0, 1.0], 0.1), "times must be"),
-    (lambda: read_by(sensors={"p": PressureProbe}), "sensors has"),
     (lambda: read_by(sensors={"p": PressureProbe([0.0] * 3)}), "position has 3 components"),
     (lambda: read_by(batch=2, sensors={"own": Reference()}), "sensors has Reference as 'own', but sensors of a batch"),
-    (lambda: plane(sensor=[{"kind": "probe", "name": "a"}]), "kind"),
     (lambda: plane(sensor=2 * [{"kind": "wall_force", "name": "a"}]), "another name"),
     (lambda: plane(sensor=[{"kind": "wall_force", "name": "a", "lower": [0.0]}]), "2 components"),
     (lambda: table(kind="flow_rate", position=[0.1, 0.1], normal=[0.0, 0.0]), r"sensor\[0\].normal is .* not zero"),
     (lambda: table(kind="wall_force", lower=[0.5, 0.0], upper=[0.1, 0.2]), r"sensor\[0\].upper is .* greater than"),
     *(
         (lambda name=name: table(kind="wall_force", name=name), r"sensor\[0\].name is .* one line of text")
-        for name in ("=cmd|calc", "+1", "-1", "@sum", " =1", "\uff1d1", "two\nlines", "a\ttab")
+        for name in ("=cmd|calc", "@sum", "\uff1d1", "two\nlines")
     ),
 ]
 
 
 def read_by(sensors, batch=None):
-    """A step of the plane, or of several, with sensors."""
     return cortado.Simulation(plane(), batch=batch).run(1, sensors=sensors)
 
 
 def table(**keys):
-    """A scene with a table of a sensor."""
     return plane(sensor=[{"name": "mine", **keys}])
 
 
-@pytest.mark.parametrize(("make", "words"), MISTAKES)
-def test_a_mistake_is_a_sentence(make, words):
-    with pytest.raises((InputError, cortado.SceneError), match=words):
-        make()
-
-
-def test_a_sensor_has_places_of_its_own_and_a_region_may_have_no_end():
-    place = np.array([0.21, 0.13])
-    probe = PressureProbe(place)
-    place[:] = 9.0
-    assert probe.position.tolist() == [0.21, 0.13]
-    sensors = {"open": WallForce(upper=[0.35, np.inf]), "left": WallForce(lower=[-np.inf, -np.inf], upper=[0.35, 9.0])}
-    read = cortado.Simulation(plane()).run(8, sensors=sensors).sensors
-    assert np.abs(read["open"].values[-1]).max() > 0.0
-    assert read["open"].values.tobytes() == read["left"].values.tobytes()
+def test_a_mistake_is_a_sentence():
+    for make, words in MISTAKES:
+        with pytest.raises((InputError, cortado.SceneError), match=words):
+            make()
 
 
 def test_a_series_in_a_batch_is_that_of_each_scene():
@@ -321,22 +268,6 @@ def test_a_series_in_a_batch_is_that_of_each_scene():
     each = [alone.value({"viscosity": viscosity}) for viscosity in viscosities]
     together = cortado.Problem(cortado.Simulation(plane(), batch=2), 4, loss).value({"viscosity": viscosities})
     assert together.tolist() == each and each[0] != each[1]
-
-
-@pytest.mark.usefixtures("unrendered")
-def test_a_run_that_diverges_says_where_also_with_sensors(tmp_path, monkeypatch, cortado_command):
-    monkeypatch.chdir(tmp_path)
-    wild = ["--set", "solver.time_step=0.08", "--set", "forces.gravity=[3000.0, -9000.0]"]
-    told = set()
-    for name, text, more in (("plain", TABLES, ()), ("looked", TABLES, ("--record", "pressure")), ("bare", "", ())):
-        (tmp_path / "scene.toml").write_text(TINY_SCENE + text)
-        run = ("run", "scene.toml", "--steps", "40", "--no-pictures", "--out", name)
-        code, _, err = cortado_command(*run, *wild, *more)
-        assert code == 1
-        told.add(err.replace(name, "").splitlines()[-1])
-    assert len(told) == 1
-    rows = list(csv.reader((tmp_path / "looked" / "sensors.csv").open()))
-    assert rows[-1][1] == "nan"
 
 
 @pytest.mark.usefixtures("unrendered")
@@ -440,17 +371,13 @@ def test_the_gradient_of_a_sensor_across_a_period_is_that_of_differences(dimensi
 BLOCK = {"name": "block", "shape": "box", "lower": [0.5, 0.0], "upper": [0.65, 0.8]}
 NOWHERE = {
     "a probe in millimetres": (PressureProbe([300.0, 100.0]), "outside of the container.*positions are in metres"),
-    "a probe behind a wall": (PressureProbe([-0.02, 0.1]), "outside of the container, which is from"),
     "a probe in a solid": (PressureProbe([0.58, 0.1]), "in the solid 'block', where it begins"),
     "a probe that sees nothing": (PressureProbe([0.2, 0.1], 1e-9), "less than half a spacing"),
     "a gauge outside": (WaveGauge([0.9, 0.0], 0.3), "outside of the container.*its floor, 0.3 m"),
-    "a gauge in a solid": (WaveGauge([0.58, 0.0]), "in the solid 'block'"),
     "a floor in millimetres": (WaveGauge([0.3, 0.0], 50.0), "has its floor at 50 m, above the container"),
     "a plane outside": (FlowRate([0.9, 0.0], [1.0, 0.1]), "has its plane through .* outside of the container"),
     "a floor below the container": (WaveGauge([0.3, 0.0], -5.0), "floor at -5 m, .* begins at 0 m: it reads 5 m less"),
-    "a floor in the water": (WaveGauge([0.3, 0.0], 0.1), "floor at 0.1 m, .* begins at 0 m: it reads 0.1 m more"),
     "a radius in millimetres": (WaveGauge([0.3, 0.0], radius=50.0), "radius of 50 m, more than the container"),
-    "a reach in millimetres": (FlowRate([0.3, 0.0], [1.0, 0.0], 50.0), "reach of 50 m, more than the container"),
     "a region without walls": (WallForce([0.3, 0.35], [0.32, 0.37]), "without walls"),
 }
 
@@ -469,33 +396,12 @@ def test_a_sensor_that_can_never_see_fluid_is_warned_of_before_the_run(sensor, w
         cortado.measured.Experiment(simulation, {"mine": observed})
 
 
-@pytest.mark.parametrize(
-    ("sensor", "metres"),
-    [
-        (PressureProbe([300.0, 100.0]), "315.8"),
-        (PressureProbe([0.2, -2.0]), "2.025"),
-        (WaveGauge([5.0, 0.0]), "4.625"),
-        (FlowRate([0.0, 5.0], [0.0, 1.0]), "4.625"),
-    ],
-)
-def test_a_sensor_far_from_all_fluid_is_warned_of_without_a_container(sensor, metres):
-    simulation = cortado.Simulation(plane(container={"shape": "none"}))
-    words = f"the sensor 'mine' is {metres} m from the fluid and the solids, which begin from"
-    with pytest.warns(CortadoWarning, match=words):
-        Watch(simulation, simulation.rollout(1), sensors={"mine": sensor})
-
-
-def test_a_direction_may_be_as_short_or_as_long_as_a_number(recwarn):
-    unit = FlowRate([0.2, 0.1], [1.0, 2.0]).normal
-    for size in (5e-321, 1e-200, 1e-50, 1e50, 1e300):
-        np.testing.assert_allclose(FlowRate([0.2, 0.1], [size, 2.0 * size]).normal, unit, rtol=1e-3)
-    named = {"kind": "flow_rate", "name": "thin", "position": [0.2, 0.1], "normal": [1e-320, 0.0]}
-    read = cortado.Simulation(plane(sensor=[named])).run(1).sensors["thin"]["flow_rate"]
-    assert np.isfinite(read).all()
-    assert cortado.Simulation(plane(forces={"gravity": [0.0, -1e-320]}, sensor=[GAUGE])).run(1).sensors["level"]
-
-
-GAUGE = {"kind": "wave_gauge", "name": "level", "position": [0.2, 0.1]}
+def test_a_sensor_far_from_all_fluid_is_warned_of_without_a_container():
+    for sensor, metres in [(PressureProbe([0.2, -2.0]), "2.025"), (FlowRate([0.0, 5.0], [0.0, 1.0]), "4.625")]:
+        simulation = cortado.Simulation(plane(container={"shape": "none"}))
+        words = f"the sensor 'mine' is {metres} m from the fluid and the solids, which begin from"
+        with pytest.warns(CortadoWarning, match=words):
+            Watch(simulation, simulation.rollout(1), sensors={"mine": sensor})
 
 
 def within_plates(dimension, gap):
@@ -532,12 +438,12 @@ def test_sensors_among_fluid_are_not_warned_of(recwarn):
     assert not [one for one in recwarn if "the sensor" in str(one.message)]
 
 
-@pytest.mark.parametrize("name", ["a, b", 'a "b"', "a [b", "a.b", "a = b"])
-def test_other_names_of_sensors_come_back_from_the_table(name, tmp_path):
-    read = Readings(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), {"height": "m"})
-    (tmp_path / "sensors.csv").write_text(as_csv({name: read}))
-    (found,) = from_csv(tmp_path / "sensors.csv").items()
-    assert found[0] == name and found[1]["height"].tolist() == [1.0, 2.0]
+def test_other_names_of_sensors_come_back_from_the_table(tmp_path):
+    for name in ["a, b", 'a "b"', "a [b.c"]:
+        read = Readings(np.array([0.0, 1.0]), np.array([[1.0], [2.0]]), {"height": "m"})
+        (tmp_path / "sensors.csv").write_text(as_csv({name: read}))
+        (found,) = from_csv(tmp_path / "sensors.csv").items()
+        assert found[0] == name and found[1]["height"].tolist() == [1.0, 2.0]
 
 
 def test_sensors_that_need_a_step_share_it(monkeypatch):
@@ -590,18 +496,3 @@ def test_a_later_run_reads_its_own_constants():
     for density in (1000.0, 800.0):
         read = simulation.run(3, {"rest_density": density}, sensors={"own": Reference()}).sensors["own"]
         assert read.values[:, 0] == pytest.approx(np.full(4, density))
-
-
-def test_a_table_grows():
-    table = Table(2)
-    for k in range(5):
-        table.add({"x": np.full((3, 2), k, dtype=np.float32)})
-    (found,) = table.arrays().values()
-    assert found.dtype == np.float32 and found[:, 2, 1].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-
-
-def test_describe_counts_what_sensors_cost(monkeypatch):
-    read = []
-    monkeypatch.setattr(StepReader, "read", lambda own, step, end, first, later: read.extend(range(step, end)))
-    steps, _ = measured_speed(cortado.Simulation(plane(sensor=[{"kind": "wall_force", "name": "walls"}])))
-    assert len(read) >= 3 * steps

