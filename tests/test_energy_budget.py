@@ -171,7 +171,7 @@ def test_pressures_are_sums_over_all_pairs_and_walls(name):
     found, solver = simulation.quantity("pressure", first), simulation.solver
     x, volume = first["positions"], simulation.lattice.volume
     L = np.empty((len(x), d, d))
-    L[solver.search.order.numpy()[: len(x)]] = solver.around["L"].numpy()[:, :d, :d]
+    L[solver.search.order.numpy()[: len(x)]] = solver.density.around["L"].numpy()[:, :d, :d]
     T = (second["pressure_impulse"] / dt)[:, None, None] * L
     (_, g), (_, wall_g) = around(simulation, x)
     apart = x[:, None] - x[None]

@@ -94,7 +94,7 @@ def test_a_step_is_that_of_the_twin():
     for steps in (1, 2, 3):
         run = simulation.run(steps, given)
         twin = Projection.of(simulation)
-        h = simulation.solver.around["image"].numpy()
+        h = simulation.solver.density.around["image"].numpy()
         assert (h > 0.9).sum() > 15 and ((h > 0.1) & (h < 0.9)).any() and np.ptp(x[h > 0.9], axis=0).min() > 0.3
         x, v, ends, _ = twin.step(x, v + dt * np.array(FALL["gravity"]), ends, m, dt)
         np.testing.assert_allclose(run.positions[-1], x, rtol=1e-10, atol=1e-11)

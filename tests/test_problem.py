@@ -9,7 +9,7 @@ import pytest
 import cortado
 from bad_scenes import one_sentence
 from cortado import CortadoWarning, InputError, Problem, Scene, Simulation, gradients, losses
-from cortado.rollout.checkpoints import checkpoint_interval
+from cortado.rollout.checkpoints import Checkpoints
 from cortado.sph.free_energy import MISCIBLE
 from scenes import jet, plane, plane_of_three, splash, two_layers
 
@@ -131,7 +131,7 @@ def without_volume():
 @pytest.mark.parametrize("steps", [1, 2, 7, 50, 1000])
 def test_checkpoints_fit_where_they_can(steps):
     for affordable in range(1, steps + 2):
-        interval = checkpoint_interval(steps, affordable)
+        interval = Checkpoints.interval(steps, affordable)
         alive = steps if interval == 1 else -(-steps // interval) + interval
         assert alive <= max(affordable, 2 * np.sqrt(steps) + 3)
 

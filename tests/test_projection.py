@@ -40,7 +40,7 @@ def begun(case, simulation):
 
 def held_and_thrown(simulation):
     solver, dt = simulation.solver, simulation.scene.solver.time_step
-    kick, gamma = solver.carried["pressure_kick"].numpy(), solver.around["beside"].numpy()
+    kick, gamma = solver.carried["pressure_kick"].numpy(), solver.density.around["beside"].numpy()
     far = dt * np.linalg.norm(kick, axis=1) > 0.1 * simulation.scene.discretisation.spacing
     return (solver.repaired[0]["held"].numpy() < 1.0).sum(), (far & ((kick * gamma).sum(1) > 0.0)).sum()
 
@@ -293,10 +293,15 @@ def prolongation(n, factor):
     return coarser if factor == 1 else np.stack([coarser, 0.5 * (coarser + np.roll(coarser, 1, 1))], 1).reshape(n, -1)
 
 
+def levels_of(precision, dimension, shape, members=1, rows=0):
+    layout = SimpleNamespace(precision=precision, members=members, device=wp.get_device("cpu"))
+    return Levels(layout, dimension, shape, rows)
+
+
 @pytest.mark.parametrize("case", ["plane", "period of three", "space"])
 def test_coarser_matrices_are_those_of_galerkin(case):
     dimension, shape = SHAPES[case]
-    levels = Levels(FLOAT64, dimension, shape, 1, wp.get_device("cpu"))
+    levels = levels_of(FLOAT64, dimension, shape)
     parts, dense, _ = system(dimension, shape, np.random.default_rng(4))
     levels.cells.assign(parts)
     levels.begin(SimpleNamespace(launch=KernelLauncher(1, levels.r.device, False)))
@@ -313,7 +318,7 @@ def test_a_solve_is_the_dense_one_for_each_scene(case, precision, tolerance, mos
     """With two rows of B, which are a large part of the matrix."""
     (dimension, shape), rng = SHAPES[case], np.random.default_rng(3)
     made = [system(dimension, shape, rng) for _ in range(2)]
-    levels = Levels(precision, dimension, shape, 2, wp.get_device("cpu"), rows=2)
+    levels = levels_of(precision, dimension, shape, 2, rows=2)
     rows = [rng.normal(size=(2, np.prod(shape))) * full for _, _, full in made]
     levels.B.assign(np.concatenate(rows, axis=1))
     r = rng.normal(size=(2, np.prod(shape))) * [full for _, _, full in made]

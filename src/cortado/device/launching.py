@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from cortado.device.modules import announce
-from cortado.device.precision import check_lanes, lanes_of
+from cortado.device.precision import check_sum, lanes_of
 from cortado.device.threads import MOST_CORES, WARP, in_parallel, usable_cores
 
 MOST_BUNDLES = 4_096
@@ -42,9 +42,7 @@ def unbundled(arguments: Iterable[Any]) -> Iterator[Any]:
 Named = Mapping[str, Any]
 
 
-def bound(
-    kernel: wp.Kernel, groups: Sequence[Named], given: Named, filled: dict[tuple[Any, ...], Any] | None = None
-) -> list[Any]:
+def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, filled: dict[Any, Any] | None = None) -> list[Any]:
     """Return the arguments of a kernel in the order of its signature. Each argument comes from ``given``, or else from
     the first of the ``groups`` with the name. Bundles are cached in ``filled``.
 
@@ -54,37 +52,30 @@ def bound(
     for name in given:
         if name not in names:
             raise TypeError(f"kernel {kernel.key} has no argument {name!r}; it has {', '.join(names)}.")
-    sources, found = (given, *groups), []
-    for name, struct, arrays in arguments:
+    sources, found, filled = (given, *groups), [], {} if filled is None else filled
+    for name, struct, fields in arguments:
         if struct is None:
             found.append(_found(name, sources, kernel))
-        else:
-            found.append(_bundled(struct, [_found(array, sources, kernel) for array in arrays], filled))
+            continue
+        arrays = [_found(field, sources, kernel) for field in fields]
+        key = (struct, *map(id, arrays))  # a bundle holds its arrays, so that their ids stay theirs
+        if key not in filled:
+            made = struct()
+            for field, array in zip(_FIELDS[struct], arrays, strict=True):
+                setattr(made, field, array)
+            if len(filled) >= MOST_BUNDLES:
+                filled.clear()
+            filled[key] = made
+        found.append(filled[key])
     return found
-
-
-def _bundled(struct: Any, arrays: Sequence[wp.array], filled: dict[tuple[Any, ...], Any] | None) -> Any:
-    key = (struct, *map(id, arrays))  # a bundle holds its arrays, so that their ids stay theirs
-    if filled and key in filled:
-        return filled[key]
-    made = struct()
-    for name, array in zip(_FIELDS[struct], arrays, strict=True):
-        setattr(made, name, array)
-    if filled is not None:
-        if len(filled) >= MOST_BUNDLES:
-            filled.clear()
-        filled[key] = made
-    return made
 
 
 def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
     for source in sources:
         if name in source:
             return source[name]
-    names, known = _signature(kernel)[0], ", ".join(dict.fromkeys(known for source in sources for known in source))
-    raise TypeError(
-        f"argument {name!r} of kernel {kernel.key} is missing; it has {', '.join(names)}; known are {known}."
-    )
+    own, known = ", ".join(_signature(kernel)[0]), ", ".join(dict.fromkeys(name for one in sources for name in one))
+    raise TypeError(f"argument {name!r} of kernel {kernel.key} is missing; it has {own}; known are {known}.")
 
 
 @cache
@@ -126,11 +117,6 @@ def _perform(name: str, threads: Any, arguments: Sequence[Any], work: Callable[[
         _watchers[-1](name, threads, arguments, work)
     else:
         work()
-
-
-@cache
-def starts_at_first(kernel: wp.Kernel) -> bool:
-    return f"{kernel.adj.args[0].label}.first" in kernel.adj.source
 
 
 def launch(
@@ -182,6 +168,7 @@ class KernelLauncher:
         most = self._cores * max(each, 1) if self._cores > 1 else 1
         self.parts = max(min(most, particles // LEAST_PART), 1)
         """Number of ranges of particles in a launch."""
+        self.capturable = self.parts == 1
         self._bounds = [particles * part // self.parts for part in range(self.parts + 1)]
         self._side = wp.Stream(device) if device.is_cuda and not record_tape else None
         self._side_is_busy = False
@@ -190,26 +177,16 @@ class KernelLauncher:
         self._whole: Any = None
         self._parts: list[Any] = []
 
-    @property
-    def capturable(self) -> bool:
-        return self.parts == 1
-
     def __call__(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
         inputs = bound(kernel, groups, arguments, self._bundles)
-        sums = hasattr(inputs[0], "neighbours")
-        if sums and threads is not None:
-            raise TypeError(f"kernel {kernel.key} sums over neighbours, and has one thread for each particle.")
         entries = threads or self.particles
-        if sums and not starts_at_first(kernel):
-            raise TypeError(
-                f"kernel {kernel.key} takes the neighbourhood s, but does not look where its range of particles "
-                "begins, and every range would write to the first: let it begin with i = s.first + wp.tid()."
-            )
-        if sums:
-            check_lanes(kernel)
-        if sums and not self.capturable and kernel in self._compiled:
-            _perform(kernel.key, entries, inputs, partial(self._launch_parts, kernel, inputs))
-            return
+        if hasattr(inputs[0], "neighbours"):
+            if threads is not None:
+                raise TypeError(f"kernel {kernel.key} sums over neighbours, and has one thread for each particle.")
+            check_sum(kernel)
+            if not self.capturable and kernel in self._compiled:
+                _perform(kernel.key, entries, inputs, partial(self._launch_parts, kernel, inputs))
+                return
         announce(kernel, self.device)
         options = {"inputs": inputs, "device": self.device, "record_tape": self._record_tape}
         _perform(kernel.key, entries, inputs, partial(wp.launch, kernel, entries * lanes_of(kernel), **options))
@@ -232,21 +209,20 @@ class KernelLauncher:
             self._side_is_busy = False
 
     def _launch_parts(self, kernel: wp.Kernel, inputs: Sequence[Any]) -> None:
-        if self._whole is not inputs[0]:
-            self._whole, self._parts = inputs[0], [self._part(inputs[0], n) for n in range(self.parts)]
+        whole = inputs[0]
+        if self._whole is not whole:
+            parts = [whole._cls() for _ in range(self.parts)]
+            for number, part in enumerate(parts):
+                for name in whole._cls.vars:
+                    setattr(part, name, getattr(whole, name))
+                part.first, part.part = self._bounds[number], number
+            self._whole, self._parts = whole, parts
 
         def launch_part(part: int) -> None:
             threads, inputs_of_part = self._bounds[part + 1] - self._bounds[part], [self._parts[part], *inputs[1:]]
             wp.launch(kernel, threads, inputs=inputs_of_part, device=self.device, record_tape=False)
 
         in_parallel(launch_part, range(self.parts), min(self._cores, self.parts))
-
-    def _part(self, neighbourhood: Any, number: int) -> Any:
-        part = neighbourhood._cls()
-        for name in neighbourhood._cls.vars:
-            setattr(part, name, getattr(neighbourhood, name))
-        part.first, part.part = self._bounds[number], number
-        return part
 
 
 class CapturedGraph:
@@ -290,23 +266,20 @@ class BandLauncher:
         def work(band: int) -> None:
             launch(kernel, bounds[band + 1] - bounds[band], self.device, first=bounds[band], **arguments)
 
-        begin = 0
+        left = iter(range(bands))
         if kernel not in self._compiled:
-            work(0)
+            work(next(left))
             self._compiled.add(kernel)
-            begin = 1
-        in_parallel(work, range(begin, bands), cores)
+        in_parallel(work, left, cores)
 
-    def to_and_fro(
-        self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **arguments: Any
-    ) -> wp.array:
+    def to_and_fro(self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **given: Any) -> wp.array:
         """Launch a kernel ``rounds`` times, and swap its input and output array after each launch. Returns the last
         output."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
-            ways: list[Callable[[], None]] = [partial(self, kernel, count, **arguments, **one) for one in both]
+            ways: list[Callable[[], None]] = [partial(self, kernel, count, **given, **one) for one in both]
         else:
-            ways = [recorded(kernel, count, self.device, first=0, **arguments, **one) for one in both]
+            ways = [recorded(kernel, count, self.device, first=0, **given, **one) for one in both]
         for k in range(rounds):
             ways[k % 2]()
         return other if rounds % 2 else values

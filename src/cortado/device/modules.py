@@ -18,12 +18,11 @@ import tempfile
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
 
 import warp as wp
@@ -45,8 +44,7 @@ def kernel_module(name: str, backward: bool = False) -> Any:
     return module
 
 
-@dataclass(frozen=True)
-class Kernels:
+class Kernels(NamedTuple):
     """A Warp kernel or function with its tangent and its adjoint."""
 
     forward: Any
@@ -71,11 +69,8 @@ def kind_of(forward: bool, taped: bool) -> str:
     return "taped" if taped else "forward"
 
 
-DERIVATIVES = "_derivative_", "_tangent_"
-
-
 def is_derivative(module: Any) -> bool:
-    return any(word in module.name for word in DERIVATIVES)
+    return "_derivative_" in module.name or "_tangent_" in module.name
 
 
 _ahead: WeakValueDictionary[int, Any] = WeakValueDictionary()
@@ -88,21 +83,30 @@ class _Said:
 
 
 def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
-    """Compile all kernels of an object and its parts, once per object. Kernels of tangents are left out. Kernels of
-    adjoints are compiled only if ``adjoints`` is true."""
-    if _ahead.get(id(owner)) is not owner:
-        _ahead[id(owner)] = owner
-        left_out = ("_tangent_",) if adjoints else DERIVATIVES
-        _compile([one for one in kernels_of(owner) if not any(word in one.module.name for word in left_out)], device)
+    """Compile all kernels of an object and its parts in parallel, once per object. Kernels of tangents are left out.
+    Kernels of adjoints are compiled only if ``adjoints`` is true. A single missing module is compiled at its launch."""
+    if _ahead.get(id(owner)) is owner:
+        return
+    _ahead[id(owner)] = owner
+    kernels = [one for one in kernels_of(owner) if "_tangent_" not in one.module.name]
+    modules = _by_size([one for one in kernels if adjoints or not is_derivative(one.module)])
+    wait([_begun.pop(module) for module in modules if module in _begun])
+    missing = [module for module in modules if not _is_compiled(module, device)]
+    if len(missing) < 2:
+        return
+    # For a GPU one after the other: NVRTC gains less from threads than it loses without its precompiled headers.
+    cores = min(usable_cores(), MOST_CORES, len(missing)) if device.is_cpu else 1
+    _Said.anything = True
+    with timed_note(f"Compiling {len(missing)} kernel modules for {device.alias}, each once on this machine"):
+        _compile_all(missing, device, cores)
 
 
 def compile_meanwhile(owner: Any, device: Any) -> None:
     """Start to compile an object's kernels in another thread. `compile_ahead` waits for the result."""
     if not device.is_cpu or usable_cores() < 2:
         return
-    sizes = _sizes([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
-    missing = _missing({module: size for module, size in sizes.items() if module not in _begun}, device)
-    if missing:
+    modules = _by_size([kernel for kernel in kernels_of(owner) if not is_derivative(kernel.module)])
+    if missing := [module for module in modules if module not in _begun and not _is_compiled(module, device)]:
         _Said.anything = True  # or else a line would come of what nobody waits for
         _begun.update(dict.fromkeys(missing, helpers().submit(_compile_all, missing, device, 1)))
 
@@ -118,7 +122,6 @@ def announce(kernel: wp.Kernel, device: Any) -> None:
 
 
 def kernels_of(owner: Any) -> list[wp.Kernel]:
-    found: dict[int, Any] = {}
     seen: dict[int, Any] = {}
     waiting = [owner]
     while waiting:
@@ -126,48 +129,26 @@ def kernels_of(owner: Any) -> list[wp.Kernel]:
         if id(one) in seen:
             continue
         seen[id(one)] = one
-        if isinstance(one, wp.Kernel):
-            found[id(one)] = one
-        elif isinstance(one, (list, tuple, set, frozenset)):
+        if isinstance(one, (list, tuple, set, frozenset)):
             waiting += one
         elif isinstance(one, Mapping):
             waiting += one.values()
-        elif isinstance(one, SimpleNamespace) or any(
-            base.__module__.startswith("cortado.") for base in type(one).__mro__
-        ):
+        elif isinstance(one, SimpleNamespace) or any(b.__module__.startswith("cortado.") for b in type(one).__mro__):
             waiting += getattr(one, "__dict__", {}).values()
-    return list(found.values())
-
-
-def _compile(kernels: Sequence[wp.Kernel], device: Any) -> None:
-    """Compile and load the missing modules of the kernels in parallel. A single missing module is compiled at its
-    launch."""
-    sizes = _sizes(kernels)
-    wait([_begun.pop(module) for module in sizes if module in _begun])
-    missing = _missing(sizes, device)
-    if len(missing) < 2:
-        return
-    # For a GPU one after the other: NVRTC gains less from threads than it loses without its precompiled headers.
-    cores = min(usable_cores(), MOST_CORES, len(missing)) if device.is_cpu else 1
-    _Said.anything = True
-    with timed_note(f"Compiling {len(missing)} kernel modules for {device.alias}, each once on this machine"):
-        _compile_all(missing, device, cores)
+    return [one for one in seen.values() if isinstance(one, wp.Kernel)]
 
 
 def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
     in_parallel(lambda module: wp.force_load(device, [module], max_workers=0), modules, cores)
 
 
-def _sizes(kernels: Sequence[wp.Kernel]) -> dict[Any, int]:
-    found: dict[Any, int] = {}
+def _by_size(kernels: Sequence[wp.Kernel]) -> list[Any]:
+    """Return the modules of kernels, those that take longest to compile first."""
+    sizes: dict[Any, int] = {}
     for kernel in kernels:
         source = kernel.adj.source
-        found[kernel.module] = found.get(kernel.module, 0) + len(source) * (10 if "s.first" in source else 1)
-    return found
-
-
-def _missing(sizes: Mapping[Any, int], device: Any) -> list[Any]:
-    return sorted((module for module in sizes if not _is_compiled(module, device)), key=lambda one: -sizes[one])
+        sizes[kernel.module] = sizes.get(kernel.module, 0) + len(source) * (10 if "s.first" in source else 1)
+    return sorted(sizes, key=lambda module: -sizes[module])
 
 
 def _is_compiled(module: Any, device: Any) -> bool:
@@ -184,22 +165,6 @@ if hasattr(os, "register_at_fork"):
 
 
 VERBOSE = "CORTADO_VERBOSE"
-
-
-@contextmanager
-def silenced() -> Iterator[None]:
-    """Suppress Warp's messages, unless the user chose a log level. After the block only warnings and errors
-    are shown."""
-    chosen = wp.config.log_level
-    if os.environ.get(VERBOSE, "0") not in ("", "0") or chosen < wp.LOG_INFO:
-        yield
-        return
-    wp.config.log_level = wp.LOG_ERROR
-    try:
-        with open(os.devnull, "w") as nothing, c_stderr_to(nothing.fileno()):
-            yield
-    finally:
-        wp.config.log_level = max(chosen, wp.LOG_WARNING)
 
 
 @contextmanager
@@ -227,16 +192,17 @@ ROOM = 16 * 2**20
 def start_warp() -> None:
     """Start Warp once per process. If Warp's cache is unusable, print a warning and compile kernels in a temporary
     folder. Raises `ComputationError` if no temporary folder can be made."""
-    reason = _start()
-    folder = wp.config.kernel_cache_dir
+    reason, folder, temporary = _start(), wp.config.kernel_cache_dir, None
     reason = reason or _trouble(folder)
     if reason is None:
         return
-    try:
-        wp.config.kernel_cache_dir = _replacement(folder)
-    except OSError:
-        wp.config.kernel_cache_dir = None
-    if wp.config.kernel_cache_dir is None or _trouble(wp.config.kernel_cache_dir):
+    with suppress(OSError):  # with links to the intact kernels in Warp's cache
+        temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        for kernel in filter(_is_whole, _kernels(folder)):
+            (Path(temporary) / kernel.name).symlink_to(kernel)
+    wp.config.kernel_cache_dir = temporary
+    if temporary is None or _trouble(temporary):
         raise ComputationError(
             f"Compiled kernels can be kept neither in {folder} ({reason}) nor in a temporary folder; "
             f"set the environment variable {CACHE_PATH} to a folder that can be written."
@@ -263,11 +229,18 @@ def complaint(error: Exception) -> str | None:
 
 
 def _start() -> str | None:
+    """Start Warp, and return the reason why it cannot store kernels, or None. Warp's messages are suppressed, and later
+    only warnings and errors are shown, unless the user chose a log level."""
+    chosen = wp.config.log_level
+    quiet = os.environ.get(VERBOSE, "0") in ("", "0") and chosen >= wp.LOG_INFO
     try:
-        with silenced():
+        with open(os.devnull, "w") as nothing, c_stderr_to(nothing.fileno()) if quiet else nullcontext():
+            wp.config.log_level = wp.LOG_ERROR if quiet else chosen
             wp.init()
     except OSError as problem:
         return problem.strerror or str(problem)
+    finally:
+        wp.config.log_level = max(chosen, wp.LOG_WARNING) if quiet else chosen
     return None
 
 
@@ -306,17 +279,6 @@ def _is_whole(kernel: Path) -> bool:
     return True
 
 
-def _replacement(folder: str) -> str:
-    """Return a temporary folder for kernels with links to the intact kernels in Warp's cache. The folder is deleted at
-    exit."""
-    temporary = tempfile.mkdtemp(prefix="cortado-kernels-")
-    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-    with suppress(OSError):
-        for kernel in filter(_is_whole, _kernels(folder)):
-            (Path(temporary) / kernel.name).symlink_to(kernel)
-    return temporary
-
-
 Version = tuple[int, int]
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 PLACE = "https://nvidia.github.io/warp/stable/user_guide/installation.html"
@@ -327,8 +289,8 @@ def why_no_gpu() -> str:
     if needed is None or found is None or found >= needed:
         return "no GPU with a CUDA driver is found"
     return (
-        f"the CUDA driver is too old, as it supports CUDA {_shown(found)} and Warp needs {_shown(needed)}: install a "
-        f"newer driver of NVIDIA's, or see {PLACE}"
+        "the CUDA driver is too old, as it supports CUDA {}.{} and Warp needs {}.{}: install a newer driver of "
+        "NVIDIA's, or see {}".format(*found, *needed, PLACE)
     )
 
 
@@ -349,22 +311,14 @@ def _needed() -> Version | None:
     return None
 
 
-def _shown(version: Version) -> str:
-    return f"{version[0]}.{version[1]}"
-
-
 def device_named(name: str) -> Any:
     """Return the Warp device with this name, or raise `InputError`."""
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
-    if not isinstance(name, str):
-        raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.")
-    try:
-        if name == "cuda" and none:
-            raise ValueError  # Warp itself would write on stderr
-        return wp.get_device(name)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.") from error
+    with suppress(RuntimeError, ValueError):
+        if isinstance(name, str) and not (name == "cuda" and none):  # of which Warp itself would write on stderr
+            return wp.get_device(name)
+    raise InputError(f"device is {shown(name)}, but must be one of: {found}{none}.")
 
 
 def visible_gpus() -> list[str]:

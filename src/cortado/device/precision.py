@@ -93,23 +93,20 @@ class TypesByName:
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
-    def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        return self._give(function, lambda kind: kind)
-
-    def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Add array types or Warp structs to the parameters of a kernel. Output arrays must come last."""
-        return self._give(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
-
-    def kernel(self, module: Any, **options: Any) -> Callable[..., Any]:
-        """Return a decorator for kernels in a Warp module, which gives types to the parameters like `arrays`."""
-        return lambda function: wp.kernel(self.arrays(function), module=module, **options)
-
-    def _give(self, function: Callable[..., Any], whole: Callable[[Any], Any]) -> Callable[..., Any]:
+    def __call__(self, function: Any, whole: Callable[[Any], Any] = lambda kind: kind) -> Callable[..., Any]:
         given = function.__annotations__
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
         types = {name: given[name] if name in given else whole(self._of(name)) for name in names}
         function.__annotations__ = types | given
         return function
+
+    def arrays(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Add array types or Warp structs to the parameters of a kernel. Output arrays must come last."""
+        return self(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
+
+    def kernel(self, module: Any, **options: Any) -> Callable[..., Any]:
+        """Return a decorator for kernels in a Warp module, which gives types to the parameters like `arrays`."""
+        return lambda function: wp.kernel(self.arrays(function), module=module, **options)
 
     def _of(self, name: str) -> Any:
         while name and name not in self._types:
@@ -176,9 +173,15 @@ def lanes_of(kernel: wp.Kernel) -> int:
 
 
 @cache
-def check_lanes(kernel: wp.Kernel) -> None:
-    """Raise `TypeError` for a kernel that sums over lanes but has only one thread per particle."""
+def check_sum(kernel: wp.Kernel) -> None:
+    """Raise `TypeError` for a kernel with a neighbourhood that begins with the wrong particle, or that sums over lanes
+    but has only one thread per particle."""
     source = kernel.adj.source
+    if f"{kernel.adj.args[0].label}.first" not in source:
+        raise TypeError(
+            f"kernel {kernel.key} takes the neighbourhood s, but does not look where its range of particles "
+            "begins, and every range would write to the first: let it begin with i = s.first + wp.tid()."
+        )
     if "wp.tid() // LANES" in source and "lane()" in source:
         return
     for function in _called(kernel.func):

@@ -20,7 +20,7 @@ from functools import cache, wraps
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import Any, TypeVar, cast
 from weakref import WeakSet
 
 import psutil
@@ -154,25 +154,18 @@ class Turn:
 _TURNS: WeakSet[Turn] = WeakSet()
 
 
-class _HasTurn(Protocol):
-    @property
-    def turn(self) -> Turn: ...
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-P = ParamSpec("P")
-R = TypeVar("R")
-Self = TypeVar("Self", bound=_HasTurn)
-
-
-def in_turn(method: Callable[Concatenate[Self, P], R]) -> Callable[Concatenate[Self, P], R]:
+def in_turn(method: Method) -> Method:
     """Decorate a method so that it holds the lock ``turn`` of its object while it runs."""
 
     @wraps(method)
-    def held(self: Self, *args: P.args, **options: P.kwargs) -> R:
+    def held(self: Any, *args: Any, **options: Any) -> Any:
         with self.turn:
             return method(self, *args, **options)
 
-    return told(held)
+    return cast(Method, told(held))
 
 
 def _begin_in_child() -> None:
@@ -385,28 +378,20 @@ def available(device: Any = None) -> float:
     """Return the free memory of a Warp device or of this process [bytes]. It is infinite if it is unknown."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
-    return max(min(float(psutil.virtual_memory().available), _of_container(), _of_process()), 0.0)
-
-
-def _of_container() -> float:
-    """Return the free memory of the Linux control group [bytes], or infinity. Cached files count as free."""
+    found = [float(psutil.virtual_memory().available)]
     for limit, used in _LIMITS:
         with suppress(OSError, ValueError):
             stat = (_CGROUP / used).with_name("memory.stat").read_text().split()
-            cached = int(stat[stat.index("inactive_file") + 1])
-            return float((_CGROUP / limit).read_text()) - float((_CGROUP / used).read_text()) + cached
-    return float("inf")
-
-
-def _of_process() -> float:
-    """Return the free address space of this process under ``ulimit -v`` [bytes]. Without a limit it is infinite."""
+            cached = int(stat[stat.index("inactive_file") + 1])  # files, which count as free
+            found.append(float((_CGROUP / limit).read_text()) - float((_CGROUP / used).read_text()) + cached)
+            break
     with suppress(ImportError, OSError, ValueError):
         import resource
 
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit != resource.RLIM_INFINITY:
-            return float(limit - psutil.Process().memory_info().vms)
-    return float("inf")
+        most = resource.getrlimit(resource.RLIMIT_AS)[0]  # of addresses, under ulimit -v
+        if most != resource.RLIM_INFINITY:
+            found.append(float(most - psutil.Process().memory_info().vms))
+    return max(min(found), 0.0)
 
 
 def _gb(size: float) -> str:

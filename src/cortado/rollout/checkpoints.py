@@ -17,18 +17,6 @@ from cortado.solvers.solver import Solver
 MEMORY_BUDGET = 8 * 2**30
 
 
-def checkpoint_interval(steps: int, affordable: int) -> int:
-    """Return the smallest number of steps between checkpoints that keeps at most ``affordable`` states in memory.
-
-    The stored states are the checkpoints, and the states between two checkpoints. If no interval suffices, return about
-    the square root of ``steps``.
-    """
-    if steps <= affordable:
-        return 1
-    intervals = range(1, isqrt(steps) + 2)
-    return next((n for n in intervals if -(-steps // n) + n <= affordable), isqrt(steps) + 1)
-
-
 class Checkpoints:
     """States of a forward run at every ``interval``-th step. A backward pass recomputes the states between them."""
 
@@ -39,6 +27,18 @@ class Checkpoints:
 
     def __len__(self) -> int:
         return len(self._states)
+
+    @staticmethod
+    def interval(steps: int, affordable: int) -> int:
+        """Return the smallest number of steps between checkpoints that keeps at most ``affordable`` states in memory.
+
+        The stored states are the checkpoints, and the states between two checkpoints. If no interval suffices, return
+        about the square root of ``steps``.
+        """
+        if steps <= affordable:
+            return 1
+        intervals = range(1, isqrt(steps) + 2)
+        return next((n for n in intervals if -(-steps // n) + n <= affordable), isqrt(steps) + 1)
 
     def keep(self, step: int, chunk: list[State], series: StateSeries, length: int, spare: list[StateSeries]) -> None:
         """Store every ``interval``-th state of a chunk of steps."""
@@ -133,10 +133,6 @@ def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], ad
         places = places[np.linalg.norm(places - was[lost.particle], axis=1) < 6.0 * spacing]
     if narrow := shut_in(containment, member, places):
         advice = f"{narrow}, or {advice}"
-    return DivergedError(
-        step=lost.step + 1,
-        particle=lost.particle,
-        advice=f"{advice}, or float64 for fluid that flies that far" if containment.is_imprecise(position) else advice,
-        where=containment.where(position),
-        others=lost.others,
-    )
+    if containment.is_imprecise(position):
+        advice = f"{advice}, or float64 for fluid that flies that far"
+    return DivergedError(lost.step + 1, lost.particle, advice, containment.where(position), lost.others)

@@ -18,18 +18,10 @@ from cortado.calls import Staying
 from cortado.device.launching import CapturedGraph, HostCopy
 from cortado.device.modules import compile_ahead
 from cortado.device.reduction import add
-from cortado.device.threads import WARP, Turn, in_turn, require, step_parts, within
+from cortado.device.threads import WARP, in_turn, require, step_parts, within
 from cortado.errors import DivergedError, InputError
 from cortado.particles.state import Parameters, State, StateSeries
-from cortado.rollout.checkpoints import (
-    MEMORY_BUDGET,
-    Beside,
-    Checkpoints,
-    ChunkReader,
-    Progress,
-    checkpoint_interval,
-    diverged,
-)
+from cortado.rollout.checkpoints import MEMORY_BUDGET, Beside, Checkpoints, ChunkReader, Progress, diverged
 from cortado.rollout.step_sizes import StepSizes
 from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepLog, StepTangent
@@ -92,11 +84,9 @@ class Rollout(Staying):
 
     @WARP
     def __init__(self, solver: Solver, steps: int, memory_budget: int = MEMORY_BUDGET):
-        self.solver, self.steps, self.room = solver, steps, steps
-        self._device = solver.device
+        self.solver, self.steps, self.room, self._device, self.turn = solver, steps, steps, solver.device, solver.turn
         require(step_parts(steps, solver.discretisation.precision.bytes), "take fewer steps", self._device)
-        self.initial = solver.new_state()
-        self.parameters = solver.new_parameters(steps)
+        self.initial, self.parameters = solver.new_state(), solver.new_parameters(steps)
         self.substeps = 0
         """Number of diffusion substeps in each step."""
         self.time_steps = np.zeros(solver.layout.members)
@@ -109,12 +99,10 @@ class Rollout(Staying):
         self.log = solver.new_log(steps)
         self.step_sizes = StepSizes()
         """Lengths of the time steps."""
-        self.progress = Progress()
-        self.taken = 0
+        self.progress, self.taken = Progress(), 0
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
-        self._interval = checkpoint_interval(steps, within(memory_budget, self._device) // state_bytes)
-        self._checkpoints = Checkpoints(self.initial, self._interval)
-        self._spare: list[StateSeries] = []
+        self._interval = Checkpoints.interval(steps, within(memory_budget, self._device) // state_bytes)
+        self._checkpoints, self._spare = Checkpoints(self.initial, self._interval), list[StateSeries]()
         self._buffer, self._bar = self.initial.following(), self.initial.like()
         self._input = self._buffer
         kind = "cpu" if self._device.is_cpu else "cuda"
@@ -126,9 +114,8 @@ class Rollout(Staying):
         self._forget_stale_graphs()
         self.copies: list[State] = []
         self.beside: dict[tuple[str, ...], Beside] = {}
-        self.longest_chunk = length
+        self.longest_chunk, self.goes_on = length, False
         self._copies = [*solver.copies, *(self.log.copies if steps <= length else ())]
-        self.goes_on = False
         self.evaluation = 0
         """Number of the current evaluation. It increases with every new first state and with new parameters."""
         self._evaluations = count(1)
@@ -148,10 +135,6 @@ class Rollout(Staying):
 
     def is_last(self, step: int) -> bool:
         return step == self.steps or self.step_sizes.is_end(step)
-
-    @property
-    def turn(self) -> Turn:
-        return self.solver.turn
 
     def begin_evaluation(self) -> None:
         """Prepare for a new first state and new parameters. Residuals in use first copy the current values."""
@@ -192,10 +175,9 @@ class Rollout(Staying):
         try:
             while step < self.steps and not ended:
                 last = step + self._length(self.steps - step)
-                self._input = (
-                    self.initial if self.room <= self.longest_chunk and state is self.initial else self._buffer
-                )
-                if self._input is self._buffer:
+                self._input = self.initial
+                if self.room > self.longest_chunk or state is not self.initial:
+                    self._input = self._buffer
                     self._buffer.assign(state)  # steps may overwrite this state
                 chunk = self._advance(step, last, reader)
                 if meanwhile is not None:
@@ -229,9 +211,7 @@ class Rollout(Staying):
             self.taken = step
             self.log.read(step)
             self._mark(self.solver.copies, is_fetched=False)
-        self._run = self.evaluation
-        if keep:
-            self._kept = self.evaluation
+        self._run, self._kept = self.evaluation, self.evaluation if keep else -1
         return state
 
     def _advance(self, first: int, last: int, reader: ChunkReader | None) -> list[State]:
@@ -330,18 +310,12 @@ class Rollout(Staying):
                 observe(n, self._bar)
             if n > 0:
                 self._buffer.assign(self._checkpoints.state(n - 1, self._replayed))
-                self._step_back(derivative, self._seek(n - 1))
+                counts = self._seek(n - 1)
+                work: Callable[[], None] = partial(derivative.step, self._buffer, counts, self._bar)
+                if derivative.capturable:
+                    work = self._steps_back.setdefault((derivative, counts), CapturedGraph(work, self.solver.launch))
+                work()
         return self._bar
-
-    def _step_back(self, derivative: BackwardStep, counts: Counts) -> None:
-        work = partial(derivative.step, self._buffer, counts, self._bar)
-        if not derivative.capturable:
-            work()
-            return
-        key = (derivative, counts)
-        if key not in self._steps_back:
-            self._steps_back[key] = CapturedGraph(work, self.solver.launch)
-        self._steps_back[key]()
 
     @in_turn
     def tangent(self, dot: State, parameters_dot: Parameters, observe: Observer) -> None:
@@ -357,18 +331,17 @@ class Rollout(Staying):
         self._buffer.assign(self.initial)
         present.assign(dot)
         observe(0, present)
+
+        def step_along(counts: Counts) -> None:
+            self.solver.replay(self._buffer, self.parameters, counts)
+            derivative.step(counts, present, self.parameters)
+            self.solver.write_state(counts, self.parameters, self._buffer)
+
         for n in range(self.steps):
-            if (counts := self._seek(n)) not in self._steps_along:
-                work = partial(self._step_along, derivative, counts, present)
-                self._steps_along[counts] = CapturedGraph(work, self.solver.launch)
-            self._steps_along[counts]()
+            counts = self._seek(n)
+            self._steps_along.setdefault(counts, CapturedGraph(partial(step_along, counts), self.solver.launch))()
             observe(n + 1, present)
         dot.assign(present)
-
-    def _step_along(self, derivative: StepTangent, counts: Counts, dot: State) -> None:
-        self.solver.replay(self._buffer, self.parameters, counts)
-        derivative.step(counts, dot, self.parameters)
-        self.solver.write_state(counts, self.parameters, self._buffer)
 
     def _require(self, what: str, evaluation: int) -> None:
         if evaluation != self.evaluation:
@@ -402,13 +375,9 @@ class Residual:
     """
 
     def __init__(self, rollout: Rollout):
-        self.rollout = rollout
+        self.rollout, self.turn = rollout, rollout.turn
         self._write_back: Callable[[], None] | None = None
         rollout.pending.add(self)
-
-    @property
-    def turn(self) -> Turn:
-        return self.rollout.turn
 
     def put_aside(self) -> None:
         rollout = self.rollout

@@ -1,7 +1,6 @@
 """Checks of the input of a run: parameters, first positions, paths of solids, and restart states."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,10 +44,8 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
         for particle in outside(scene.room, positions[:free], spacing)[:1]:
-            place = f"{point_in_words(positions[particle])} m"
-            raise InputError(
-                f"parameter initial_positions has particle {particle} at {place}, outside the container or in a solid."
-            )
+            wrong = f"parameter initial_positions has particle {particle} at {point_in_words(positions[particle])} m"
+            raise InputError(f"{wrong}, outside the container or in a solid.")
         room = np.prod(np.ptp(positions[:free], axis=0) + spacing) if free else np.inf
         if room < 0.5 * (needed := free * spacing**scene.dimension):
             unit = "m2" if scene.dimension == 2 else "m3"
@@ -119,10 +116,8 @@ class FirstPositions:
                 wanted = f"at least {NEAREST:g} of them"
                 found = f"particles at initial_positions are only {least:.2g} spacings apart, which should be {wanted}."
         self._judged[member] = positions.copy()
-        if found is None or self._warned:
-            return None
-        self._warned = True
-        return found
+        told, self._warned = self._warned, self._warned or found is not None
+        return None if told else found
 
 
 FURTHEST = 1.0
@@ -131,66 +126,55 @@ SCALES = (0.6, 1.5)
 """Smallest and greatest scale of a solid with wall particles. Beyond these scales, fluid leaks."""
 
 
-def path_sentence(
-    scene: Scene, first: State, values: Arrays, run: Arrays, courses: Mapping[str, Changing]
-) -> str | None:
+def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, courses: dict[str, Changing]) -> str | None:
     """Return a sentence about the first invalid path or scale of a solid or nozzle, or None. ``run`` has the values of
     all time steps."""
-    leaps = _leaps(scene, values, courses) if scene.solver.chooses else ()
-    return next(chain(_stretches(scene, values), leaps, _jumps(scene, first, run, courses)), None)
-
-
-def _leaps(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Yield sentences on paths that move more than a spacing even in the shortest time step."""
-    spacing = scene.discretisation.spacing
-    for what, moved in moved_by(scene, values, courses).items():
+    spacing, furthest = scene.discretisation.spacing, FURTHEST * scene.discretisation.spacing * (1.0 + 1e-6)
+    if wrong := _stretched(scene, values):
+        return wrong
+    for what, moved in moved_by(scene, values, courses).items() if scene.solver.chooses else ():
         travel = Travel.of(scene, values, [moved])
         sizes = travel.at(travel.times + travel.least) - travel.lengths
-        if (size := sizes.max()) > FURTHEST * spacing * (1.0 + 1e-6):
-            yield (
+        if (size := sizes.max()) > furthest:
+            return (
                 f"{what} goes {size:.3g} m in {travel.least:.2g} s, the shortest step there is, at "
                 f"{travel.times[sizes.argmax()]:g} s, which is further than a spacing, {spacing:g} m: fluid is left "
                 "behind in it. Give it more time."
             )
-
-
-def _jumps(scene: Scene, first: State, run: Arrays, courses: Mapping[str, Changing]) -> Iterator[str]:
-    """Yield sentences on solids that move more than a spacing in a time step. Only the first scene of a batch is
-    checked."""
-    spacing = scene.discretisation.spacing
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
             continue
         position = position_name(table.name)
         begun = first.numpy(scene.dimension, only=[position])[position].reshape(-1, scene.dimension)[:1]
         places = np.concatenate([begun, run[position] + run[displacement_name(table.name)]])
-        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-        if (size := steps.max(initial=0.0)) > FURTHEST * spacing * (1.0 + 1e-6):
-            yield (
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)  # in a batch those of the first scene
+        if (size := steps.max(initial=0.0)) > furthest:
+            return (
                 f"the solid {table.name!r} goes {size:.3g} m in step {steps.argmax() + 1} of this run, which is "
                 f"further than a spacing, {spacing:g} m: fluid is left behind in it. A displacement begins near 0, and "
                 f"a run that goes on from a state is given {position} as the first one was."
             )
+    return None
 
 
-def _stretches(scene: Scene, values: Arrays) -> Iterator[str]:
-    """Yield sentences on solids with an invalid scale."""
-    spacing, periods = scene.discretisation.spacing, scene.periods[1]
+def _stretched(scene: Scene, values: Arrays) -> str | None:
+    """Return a sentence about the first solid with an invalid scale, or None."""
+    (least, most), periods = SCALES, scene.periods[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
         if scale == 1.0:
             continue
         start = f"the solid {table.name!r} is {scale:.4g} times as large as in the scene"
-        least, most = SCALES
         if not least <= scale <= most:
-            yield f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
+            return f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
         size = float(np.ptp(table.shape_about()[0].extent(), axis=0).max())
         grown = 0.5 * size * (1.0 - scale if table.side == "inside" else scale - 1.0)
-        if grown > FURTHEST * spacing and "initial_positions" not in values:
-            yield f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
+        if grown > FURTHEST * scene.discretisation.spacing and "initial_positions" not in values:
+            return f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
         lower, upper = table.solid().extent()
         if ((periods > 0.0) & (upper - lower > periods * (1.0 - WHOLE))).any():
-            yield f"{start}, so that it does not fill a period of the container, as it does there."
+            return f"{start}, so that it does not fill a period of the container, as it does there."
+    return None
 
 
 SAME = 1e-6
@@ -277,12 +261,9 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
     drained, spacing = fields.get("drained", np.zeros(len(positions))), scene.discretisation.spacing
     in_fluid = (drained == 0.0) & ~waits(scene, fields, len(positions))
     free = np.flatnonzero(in_fluid[: simulation.free_particles])
-    for index in outside(scene.resting_room, positions[free], spacing)[:1] if held else ():
-        particle = free[index]
-        place = f"{point_in_words(positions[particle])} m"
-        raise InputError(
-            f"state positions has particle {particle} at {place}, outside the container of this scene or in a solid."
-        )
+    for particle in free[outside(scene.resting_room, positions[free], spacing)[:1]] if held else ():
+        wrong = f"state positions has particle {particle} at {point_in_words(positions[particle])} m"
+        raise InputError(f"{wrong}, outside the container of this scene or in a solid.")
     if scene.forces.pressure:
         check_apart("state positions", positions, origin.spacing, scene.periods)
 
@@ -303,9 +284,8 @@ def _check_origin(found: Origin, wanted: Origin) -> None:
         one, other = getattr(found, name), getattr(wanted, name)
         if one is None:
             continue
-        if isinstance(one, str) or isinstance(other, str):
-            is_same = one == other
-        else:
+        is_same = one == other
+        if not (is_same or isinstance(one, str) or isinstance(other, str)):
             is_same = np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=SAME, atol=0.0)
         if not is_same:
             raise InputError(

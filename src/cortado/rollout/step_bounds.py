@@ -161,26 +161,19 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
         rollout.step_sizes = ChosenSteps(rollout.solver, rollout.parameters, rollout.room, length)
     least = 1.0 / rollout.solver.layout.precision.greatest
     bounds = np.stack([step_bounds(scene, own, rollout.steps, least) for own in members], axis=1)
-    scheduled = Courses(rollout, scene, parameters, members) if any(map(parameters.courses, members)) else None
-    rollout.clocks = rollout.step_sizes.begin(rollout.clocks, bounds, scheduled)
+    changes = any(map(parameters.courses, members))
+    of_courses = [scheduled_bounds(scene, own, parameters) for own in members] if changes else []
+
+    def longest(times: NDArray) -> NDArray:
+        each = zip(of_courses, times.tolist(), strict=True)
+        return np.array([min(bound.longest(time) for bound in own.values()) for own, time in each])
+
+    def fill(step: int, times: NDArray, sizes: NDArray) -> None:
+        each = zip(members, times.tolist(), sizes.tolist(), strict=True)
+        rollout.parameters.set_row(step, stacked([parameters.scheduled_at(*one) for one in each]))
+
+    rollout.clocks = rollout.step_sizes.begin(rollout.clocks, bounds, (longest, fill) if changes else None)
     rollout.step_sizes.begin_at(rollout.initial)
-
-
-class Courses:
-    """Bounds on time steps and values of scheduled parameters at the current time of each scene."""
-
-    def __init__(self, rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]):
-        self._rollout, self._parameters, self._members = rollout, parameters, members
-        self._bounds = [scheduled_bounds(scene, own, parameters) for own in members]
-
-    def longest(self, times: NDArray) -> NDArray:
-        each = zip(self._bounds, times.tolist(), strict=True)
-        return np.array([min(bound.longest(time) for bound in bounds.values()) for bounds, time in each])
-
-    def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        each = zip(self._members, times.tolist(), sizes.tolist(), strict=True)
-        rows = [self._parameters.scheduled_at(*one) for one in each]
-        self._rollout.parameters.set_row(step, stacked(rows))
 
 
 def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:

@@ -5,11 +5,11 @@ The step keeps its length if a shorter step does not help. The choice depends on
 run therefore has the same steps as a run without interruption.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import inf
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -29,18 +29,13 @@ SHORTER = 0.25
 """Length of a repeated step, relative to its previous length."""
 
 
-@dataclass(frozen=True)
-class Try:
-    size: float
-    added: float
-    """Greatest increase of the compression of a particle, or infinity for a lost particle."""
-
-
 class Retaken:
     """The repeated steps of a run."""
 
     def __init__(self) -> None:
-        self._tries: dict[tuple[int, int], tuple[float, list[Try]]] = {}
+        self._tries: dict[tuple[int, int], tuple[float, list[tuple[float, float]]]] = {}
+        """Shortest length by (step, scene), and the length and increase of compression of each try, which is infinite
+        for a lost particle."""
         self._settled: set[tuple[int, int]] = set()
 
     def found(
@@ -58,22 +53,21 @@ class Retaken:
             pressing = [first + int(n) for n in np.flatnonzero(added[:, member] > PRESSED) if first + n < end]
             for step in (*pressing, end) if first <= end < first + len(added) else pressing:
                 n, key = step - first, (step, member)
-                now = Try(float(sizes[n, member]), np.inf if step == end else float(added[n, member]))
-                if key not in self._settled and (size := self._next(key, now, 0.01 * float(longest[n, member]))):
+                now = inf if step == end else float(added[n, member])
+                least = 0.01 * float(longest[n, member])
+                if key not in self._settled and (size := self._next(key, float(sizes[n, member]), now, least)):
                     again[key] = size
                     break
         return again
 
-    def _next(self, key: tuple[int, int], now: Try, least: float) -> float | None:
+    def _next(self, key: tuple[int, int], size: float, added: float, least: float) -> float | None:
         least, tries = self._tries.setdefault(key, (least, []))
-        tries.append(now)
-        helped = len(tries) == 1 or not np.isfinite(tries[-2].added) or now.added <= 0.5 * tries[-2].added
-        if helped and len(tries) <= 2 and SHORTER * now.size >= least:
-            return SHORTER * now.size
+        helped = not tries or not np.isfinite(tries[-1][1]) or added <= 0.5 * tries[-1][1]
+        tries.append((size, added))
+        if helped and len(tries) <= 2 and SHORTER * size >= least:
+            return SHORTER * size
         self._settled.add(key)
-        whole = [one for one in tries if np.isfinite(one.added)]
-        stays = whole[0] if whole and not helped else now
-        return None if stays is now else stays.size
+        return None if helped else next((one for one, more in tries[:-1] if np.isfinite(more)), None)
 
 
 class Compressions:
@@ -84,7 +78,8 @@ class Compressions:
         self._solver, (self._compare, self._record) = solver, compression_kernels(layout.precision)
         self._each = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
-        self._added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
+        self.added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
+        """Increase of compression (steps, members) [-]."""
 
     def measure(self, state: State) -> None:
         """Record the increase of compression in the step before ``state``."""
@@ -94,11 +89,7 @@ class Compressions:
         repaired = {"excess": solver.repaired[0]["excess"], "x_free": solver.repaired[0]["x_now"]}
         solver.launch(self._compare, numbers, now, repaired, added=self._each)
         greatest = {"greatest": self._greatest(self._each), "step": solver.step_number}
-        solver.launch(self._record, greatest, added=self._added, threads=members)
-
-    def read(self, first: int, last: int) -> NDArray[np.float64]:
-        """Return the increase of compression (last - first, members) [-] in the steps from ``first`` to ``last``."""
-        return np.asarray(self._added[first:last].numpy(), dtype=np.float64)
+        solver.launch(self._record, greatest, added=self.added, threads=members)
 
 
 @cache
@@ -137,13 +128,9 @@ LEAST = 1e-6
 """Shortest time step for fast fluid, relative to the bound without fluid."""
 
 
-class Scheduled(Protocol):
-    def longest(self, times: NDArray) -> NDArray:
-        """Return the longest allowed time steps (members,) [s] from ``times`` (members,) [s] on."""
-
-    def fill(self, step: int, times: NDArray, sizes: NDArray) -> None:
-        """Write the scheduled parameters of a time step at ``times`` (members,) [s] with the lengths ``sizes``
-        (members,) [s]."""
+Scheduled = tuple[Callable[[NDArray], NDArray], Callable[[int, NDArray, NDArray], None]]
+"""Two functions: of times (members,) [s], which returns the longest time steps from then on; and of the number, the
+times and the lengths (members,) [s] of a step, which writes its scheduled parameters."""
 
 
 @dataclass(frozen=True)
@@ -210,21 +197,18 @@ class ChosenSteps(StepSizes):
     def __init__(self, solver: Solver, parameters: Parameters, steps: int, length: float):
         """Allocate arrays for ``steps`` steps. A particle may move by ``length`` [m] in a step."""
         layout, device, real = solver.layout, solver.device, solver.layout.precision.real
-        shape = (steps + 1, layout.members)
         self._solver, self._parameters, self._length = solver, parameters, length
         self._speeds, self._choice = step_size_kernels(layout.precision)
+        shape, bounded = (steps + 1, layout.members), (max(steps, 1), layout.members)
         self._squares = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
-        self._sizes, self._longest = (wp.zeros(shape, dtype=real, device=device) for _ in range(2))
+        sizes = shape, shape, bounded, layout.members
+        self._sizes, self._longest, self._bounds, self._first = (wp.zeros(n, real, device=device) for n in sizes)
         self._times = wp.zeros(shape, dtype=wp.float64, device=device)
-        self._bounds = wp.zeros((max(steps, 1), layout.members), dtype=real, device=device)
-        self._first = wp.zeros(layout.members, dtype=real, device=device)
         self._read = RecordedSizes(np.zeros(shape), np.zeros(shape))
         self._scheduled: Scheduled | None = None
         self._compressions = Compressions(solver, steps) if isinstance(solver, ProjectionSteps) else None
         self._steps, self._retaken = steps, Retaken()
-        self.end = inf
-        self.longest_chunk = StepSizes.longest_chunk
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
         """Prepare a run with upper bounds (steps, members) [s] of the time steps, and return clocks that
@@ -286,7 +270,8 @@ class ChosenSteps(StepSizes):
             return False
         taken, longest = (array[first:last].numpy() for array in (self._sizes, self._longest))
         lost = {member: one.step for member, one in self._solver.containment.lost().items()}
-        found = self._retaken.found(first, self._compressions.read(first, last), taken, longest, lost)
+        added = self._compressions.added[first:last].numpy().astype(np.float64)
+        found = self._retaken.found(first, added, taken, longest, lost)
         if not found:
             return False
         sizes, bounds = self._sizes.numpy(), self._bounds.numpy()
@@ -302,19 +287,19 @@ class ChosenSteps(StepSizes):
 
     def _look(self, first: int, last: int) -> None:
         """Read the lengths and times of steps."""
-        for found, array in ((self._read.sizes, self._sizes), (self._read.times, self._times)):
-            found[first : last + 1] = array[first : last + 1].numpy()
+        of = slice(first, last + 1)
+        self._read.sizes[of], self._read.times[of] = self._sizes[of].numpy(), self._times[of].numpy()
         if self._scheduled is None:
             return
-        times, sizes = self._read.times[last], self._read.sizes[last]
-        longest = self._scheduled.longest(times)
+        times, sizes, (longest_from, fill) = self._read.times[last], self._read.sizes[last], self._scheduled
+        longest = longest_from(times)
         if (sizes > longest).any():
             own = self._sizes[last : last + 1]
             own.assign(np.minimum(sizes, longest)[None])
             sizes[:] = own.numpy()[0]
             self.seek(last)
         if last < self._steps:
-            self._scheduled.fill(last, times, sizes)
+            fill(last, times, sizes)
 
     def of_step(self, step: int) -> NDArray:
         return self._read.sizes[step].copy()
@@ -350,18 +335,9 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def choose(
-        length: real,
-        least: real,
-        growth: real,
-        greatest,
-        bounds: wp.array2d(dtype=real),
-        first,
-        step,
-        times: wp.array2d(dtype=wp.float64),
-        sizes: wp.array2d(dtype=real),
-        longest: wp.array2d(dtype=real),
-        time_step,
-    ):
+        length: real, least: real, growth: real, greatest, bounds: wp.array2d(dtype=real), first, step,
+        times: wp.array2d(dtype=wp.float64), sizes: wp.array2d(dtype=real), longest: wp.array2d(dtype=real), time_step,
+    ):  # fmt: skip
         """Write the time before the step, and the time step dt of each scene.
 
         dt is the minimum of three terms: ``bounds``, ``growth`` times the previous dt, and ``length`` divided by the

@@ -303,7 +303,7 @@ class SolidLoads:
         vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number
         self._loads, self._layout, self._solid = loads, layout, number
         self._kernels, self._moving = load_kernels(layout.precision), solver.search.moving if number >= 0 else None
-        self._given = {"cell": loads.cell, "period": vector(*solver.system.periods)}
+        self._given = {"cell": loads.cell, "period": layout.precision.vector_of(solver.system.walled.periods)}
         rest = wp.full(layout.members, vector(*solid.middle), dtype=vector, device=layout.device)
         self._rest = {"middle": rest, "middle_dot": wp.zeros_like(rest)}
         self._bars = {name: solver.vectors() for name in ("f_bar", "twist_bar", "middle_bar")}

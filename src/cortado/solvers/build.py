@@ -191,7 +191,7 @@ def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
 def solver_named(table: SolverTable) -> SolverMaker:
     if isinstance(table, PackageSolver):
         return checked_solver(table.make())
-    made: SolverMaker = import_module(f"cortado.solvers.{table.kind}.solver").maker(table)
+    made: SolverMaker = import_module(f"cortado.solvers.{table.kind}.solver").Maker(table)
     return made
 
 
@@ -236,32 +236,25 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     faces = flat_faces(scene, discrete.lattice.support, most)
     search = _search(setting, shared, layout, bool(np.isfinite(mirrors).any()), faces)
     sheets = Sheets(placed, spacing, layout) if placed else None
-    still = [_obstacle(table, table.solid(), spacing) for table in scene.solid if not table.moves]
-    moved = [_obstacle(table, table.own_solid(), spacing) for table in moving(scene.solid)]
+
+    def obstacle(table: SolidTable, solid: Solid) -> Obstacle:
+        return Obstacle(table.name, solid, table.side == "inside", table.thinnest(spacing))
+
+    still = [obstacle(table, table.solid()) for table in scene.solid if not table.moves]
+    moved = [obstacle(table, table.own_solid()) for table in moving(scene.solid)]
     # Without pressure, walls do not stop particles and are left out.
     holds, solids = (scene.container, (still, moved)) if scene.forces.pressure else (NoContainer(), ([], []))
     region = holds.region(scene.dimension).opened(discrete.periods)
     free = _free_solids(setting, search, layout, still, moved)
+    walled = Walled(region, discrete.near, spacing, tuple(solids[0]), tuple(solids[1]), discrete.periods)
+    named = {one.name: NamedSolid(numbers[one.name], padded(one.middle()[None])[0]) for one in scene.solid}
+    around = 0 if drains else discrete.fluid.emitted.start, walled, mirrors, faces, named, sheets
 
-    def system(discretisation: Discretisation) -> ParticleSystem:
-        made = Setting(scene, discretisation, discrete.lattice, discrete.wall_layers, layout)
-        return ParticleSystem(
-            setting.called,
-            discretisation,
-            layout,
-            discrete.lattice,
-            search,
-            [*_forces(made, setting.forces), *([Drains(drains, layout, discretisation.taped)] if drains else [])],
-            [*discrete.periods, *[0.0] * (3 - scene.dimension)],
-            _parts(setting, discretisation, search, free),
-            0 if drains else discrete.fluid.emitted.start,
-            Walled(region, discrete.near, spacing, tuple(solids[0]), tuple(solids[1]), discrete.periods),
-            mirrors,
-            faces,
-            {one.name: NamedSolid(numbers[one.name], padded(one.middle()[None])[0]) for one in scene.solid},
-            sheets,
-            of_one_lane=lambda: system(replace(discretisation, lanes=1, taped=True)),
-        )
+    def system(own: Discretisation) -> ParticleSystem:
+        made = Setting(scene, own, discrete.lattice, discrete.wall_layers, layout)
+        forces = [*_forces(made, setting.forces), *([Drains(drains, layout, own.taped)] if drains else [])]
+        fluid = own, layout, discrete.lattice, search, forces, _parts(setting, own, search, free)
+        return ParticleSystem(setting.called, *fluid, *around, lambda: system(replace(own, lanes=1, taped=True)))
 
     return system(shared)
 
@@ -271,9 +264,8 @@ def _search(
 ) -> NeighbourSearch:
     scene, discrete, spacing = setting.scene, setting.discrete, setting.scene.discretisation.spacing
     near, support, walls = discrete.near, discrete.lattice.support, discrete.walls
-    grid = Grid.around(
-        near.lower, near.upper, discrete.periods, (1.0 + SKIN) * support, most=max(4 * layout.particles, 512)
-    )
+    most = max(4 * layout.particles, 512)
+    grid = Grid.around(near.lower, near.upper, discrete.periods, (1.0 + SKIN) * support, most)
     positions, feet, (middles, turns) = walls.positions.copy(), walls.feet.copy(), solid_frames(scene)
     for number, (middle, turn) in enumerate(zip(middles, turns, strict=True)):
         own = walls.solid == number
@@ -292,30 +284,27 @@ def _forces(setting: Setting, makers: Sequence[ForceMaker]) -> list[Force]:
     modules = [p.force for p in PARAMETERS if p.force is not None and p.present(scene) and p.force not in replaced]
     forces: list[Force] = []
     for maker in (*map(import_module, modules), *makers):
-        if (force := maker.force(setting)) is not None:
-            _check_force(force, maker, setting.layout.batch)
-            forces.append(force)
-    return sorted(forces, key=lambda one: bool(getattr(one, "is_last", False)))
-
-
-def _check_force(force: Force, maker: Any, batch: int | None) -> None:
-    name = type(force).__name__
-    if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
-        made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
-        raise InputError(f"{made}, but must have {', '.join(FORCE_ATTRIBUTES)}.")
-    if not isinstance(force, Part):
-        if found := [method for method in PART_METHODS if hasattr(force, method)]:
+        if (force := maker.force(setting)) is None:
+            continue
+        forces.append(force)
+        name, batch = type(force).__name__, setting.layout.batch
+        if missing := [one for one in FORCE_ATTRIBUTES if not hasattr(force, one)]:
+            made = f"the force {name}, which {shown(maker)} made, has no {missing[0]}"
+            raise InputError(f"{made}, but must have {', '.join(FORCE_ATTRIBUTES)}.")
+        of_part = [method for method in PART_METHODS if hasattr(force, method)]
+        if of_part and not isinstance(force, Part):
             raise InputError(
-                f"the force {name} has the methods {', '.join(found)} of a part, but is no Part: derive its class "
+                f"the force {name} has the methods {', '.join(of_part)} of a part, but is no Part: derive its class "
                 "from cortado.sph.parts.Part."
             )
-    elif type(force).end is Part.end and not all(field.is_constant for field in force.fields):
-        raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")
-    if batch is not None and not getattr(force, "batches", False):
-        raise InputError(
-            f"batch is {batch}, but must be left out, as the force {name} has no `batches = True`, which says that its "
-            "kernels read the parameters of a particle's own scene."
-        )
+        if isinstance(force, Part) and type(force).end is Part.end and not all(f.is_constant for f in force.fields):
+            raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")
+        if batch is not None and not getattr(force, "batches", False):
+            raise InputError(
+                f"batch is {batch}, but must be left out, as the force {name} has no `batches = True`, which says that "
+                "its kernels read the parameters of a particle's own scene."
+            )
+    return sorted(forces, key=lambda one: bool(getattr(one, "is_last", False)))
 
 
 def _parts(
@@ -337,43 +326,31 @@ def _parts(
 def _free_solids(
     setting: SolverSetting, search: NeighbourSearch, layout: Layout, still: list[Obstacle], moved: list[Obstacle]
 ) -> FreeSolids | None:
-    scene, spacing, periods = setting.scene, setting.scene.discretisation.spacing, setting.discrete.periods
-    solids, tables = moving(scene.solid), []
-    for number, table in enumerate(solids):
-        if table.motion == "free":
-            mass = mass_of_one(table).in_volumes(spacing**scene.dimension)
-            hold = Hold.of(table, scene.dimension, scene.hinge)
-            tables.append(FreeTable(table.name, number, weight_name(table), mass, hold, table.sticks))
-    if not tables:
+    scene, discrete, spacing = setting.scene, setting.discrete, setting.scene.discretisation.spacing
+    walls, solids = discrete.walls, moving(scene.solid)
+    bodies = [number for number, table in enumerate(solids) if table.motion == "free"]
+    if not bodies:
         return None
-    touching = _touching(setting, still, moved)
-    pushes: list[Callable[[FreeSolidsPart], Push]] = [lambda part: Contacts(part, touching, spacing, periods, layout)]
-    springs, joints = ends_of(scene.spring, solids), joints_of(scene.hinge, solids)
-    turned, joined = ([one for one in joints if one.turns], [one for one in joints if one.against >= 0])
-    if springs or turned:
-        pushes.append(lambda part: Springs(part, springs, turned, layout))
-    return FreeSolids(tables, scene.dimension, search, pushes, joined)
-
-
-def _touching(setting: SolverSetting, still: list[Obstacle], moved: list[Obstacle]) -> list[Touching]:
-    scene, walls, spacing = setting.scene, setting.discrete.walls, setting.scene.discretisation.spacing
-    tables = moving(scene.solid)
-    bodies = [number for number, table in enumerate(tables) if table.motion == "free"]
-    sides = scene.container.solids(scene.dimension, setting.discrete.lattice.support)
+    sides = scene.container.solids(scene.dimension, discrete.lattice.support)
     fixed = [*(Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides), *still]
-    found = []
+    tables, touching = [], []
     for body, number in enumerate(bodies):
-        table, own = tables[number], walls.solid == number
+        table, own = solids[number], walls.solid == number
+        mass = mass_of_one(table).in_volumes(spacing**scene.dimension)
+        hold = Hold.of(table, scene.dimension, scene.hinge)
+        tables.append(FreeTable(table.name, number, weight_name(table), mass, hold, table.sticks))
         feet = walls.positions[own] - table.middle() + walls.feet[own]
         near = feet[np.linalg.norm(walls.feet[own], axis=1) < spacing] @ table.turn(scene.dimension)
         points = np.concatenate([near, table.own_solid().faces(FINE * spacing).vertices])
-        found.append(Touching(body, -1, -1, fixed, points))
-        for against, one in enumerate(tables):
+        touching.append(Touching(body, -1, -1, fixed, points))
+        for against, one in enumerate(solids):
             if against != number:
                 other = bodies.index(against) if against in bodies else -1
-                found.append(Touching(body, against, other, [moved[against]], points, one.surface_velocity or ()))
-    return found
-
-
-def _obstacle(table: SolidTable, solid: Solid, spacing: float) -> Obstacle:
-    return Obstacle(table.name, solid, table.side == "inside", table.thinnest(spacing))
+                touching.append(Touching(body, against, other, [moved[against]], points, one.surface_velocity or ()))
+    springs, joints = ends_of(scene.spring, solids), joints_of(scene.hinge, solids)
+    turned, joined = ([one for one in joints if one.turns], [one for one in joints if one.against >= 0])
+    pushes: list[Callable[[FreeSolidsPart], Push]] = []
+    pushes.append(lambda part: Contacts(part, touching, spacing, discrete.periods))
+    if springs or turned:
+        pushes.append(lambda part: Springs(part, springs, turned, layout))
+    return FreeSolids(tables, scene.dimension, search, pushes, joined)

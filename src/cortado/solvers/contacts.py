@@ -35,11 +35,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from cortado.device.launching import Named, bundle
 from cortado.device.precision import Precision, TypesByName
 from cortado.device.reduction import add, sum_of
+from cortado.discretise.shapes import Points
 from cortado.particles.moving_walls import resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Layout, Parameters, padded, zeros
@@ -219,7 +219,7 @@ class Touching:
     other: int
     """Index of the touched solid among the free bodies; -1 if it is not a free body."""
     obstacles: Sequence[Obstacle]
-    points: NDArray[np.float64]
+    points: Points
     """Points of the body's surface, in the frame of the body (n, d) [m]."""
     slides: Sequence[float] = ()
     """Velocity of the touched solid's sliding surface, in the solid's frame (d,) [m/s]."""
@@ -231,39 +231,33 @@ class Contact:
         self.meshes = [obstacle_mesh(one, spacing, device) for one in touching.obstacles]
         self.places: list[dict[str, Any]] = []
         for one, mesh in zip(touching.obstacles, self.meshes, strict=True):
-            middle, none = precision.vector(*padded(middle_of(one)[None])[0]), precision.vector()
+            middle, none = precision.vector_of(middle_of(one)), precision.vector()
             origin, inner = (middle, none) if touching.against < 0 else (none, middle)
             side = -1.0 if one.is_hollow else 1.0
             self.places.append({"mesh": mesh.id, "origin": origin, "inner": inner, "side": side})
         points, real, vector = padded(touching.points), precision.real, precision.vector
-        self.slides = vector(*padded(np.array([touching.slides]))[0]) if len(touching.slides) else vector()
+        self.slides = precision.vector_of(touching.slides or (0.0, 0.0))
         self.count, self.layout = len(points), layout
         self.own = wp.array(np.tile(points, (layout.members, 1)), dtype=vector, device=device)
         self.all = layout.members * self.count
         self.found = self.arrays({"face": vector, "plane": real, "shift": vector, "depth": real})
         """Nearest faces above the surface points of the body."""
 
+    def given(self, each: Sequence[FreeBody | Changes]) -> Arrays:
+        """Return the momenta of the two solids, or the tangents or adjoints of the momenta."""
+        return given_to(each, self.touching.body, self.touching.other)
+
     def arrays(self, kinds: Mapping[str, Any]) -> Arrays:
         return {name: wp.zeros(self.all, dtype=kind, device=self.layout.device) for name, kind in kinds.items()}
-
-    def poses(self, each: Sequence[Named]) -> Named:
-        """Return the pose, scale and tangents of the touched solid by names of kernel arguments. ``each`` has the
-        arrays of all moving solids."""
-        against = self.touching.against
-        other = resting_pose(self.layout) if against < 0 else each[against]
-        return {f"other_{name}": array for name, array in other.items()}
 
 
 class Totals:
     """Terms of the surface points of a body, and the sums of the terms over each scene."""
 
     def __init__(self, contact: Contact, kinds: Mapping[str, Any], suffix: str = "", end: str = "_sum"):
-        layout = contact.layout
+        size = contact.count, contact.layout.device, contact.layout.members
         self.each = contact.arrays({f"{name}{suffix}": kind for name, kind in kinds.items()})
-        self._totals = {
-            f"{name}{end}{suffix}": sum_of(kind, contact.count, layout.device, layout.members)
-            for name, kind in kinds.items()
-        }
+        self._totals = {f"{name}{end}{suffix}": sum_of(kind, *size) for name, kind in kinds.items()}
 
     def sums(self) -> Arrays:
         pairs = zip(self._totals.items(), self.each.values(), strict=True)
@@ -276,30 +270,27 @@ def share_kinds(layout: Layout) -> dict[str, Any]:
 
 
 class Contacts:
-    def __init__(
-        self,
-        part: FreeSolidsPart,
-        touching: Sequence[Touching],
-        spacing: float,
-        periods: NDArray[np.float64],
-        layout: Layout,
-    ):
+    def __init__(self, part: FreeSolidsPart, touching: Sequence[Touching], spacing: float, periods: Points):
         """Prepare contacts. ``periods`` (d,) are the lengths of the periodic box [m], 0 along axes that are not
         periodic."""
+        layout = part.layout
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
-        self._poses = [contact.poses(part.made_of.walls.each) for contact in self.contacts]
-        vector = layout.precision.vector
-        self._period, self._axes = (vector(*padded(one[None])[0]) for one in (periods, np.ones_like(periods)))
+        of_solids = part.made_of.walls.each
+        self._poses: list[Named] = []
+        """Pose, scale and tangents of each touched solid by names of kernel arguments."""
+        for against in (contact.touching.against for contact in self.contacts):
+            other = resting_pose(layout) if against < 0 else of_solids[against]
+            self._poses.append({f"other_{name}": array for name, array in other.items()})
+        self._period, self._axes = map(layout.precision.vector_of, (periods, np.ones_like(periods)))
         self._shares = [Totals(contact, share_kinds(layout)) for contact in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
         unsaid = {"friction": 0.0, "restitution": RESTITUTION}
-        self._unsaid = {
-            f"{label}{suffix}": wp.full(layout.members, 0.0 if suffix else value, layout.precision.real, layout.device)
-            for label, value in unsaid.items()
-            for suffix in ("", "_dot", "_bar")
-        }
+        self._unsaid: Arrays = {}
         """Default coefficients of friction and restitution."""
+        for label, value in unsaid.items():
+            for name, number in ((label, value), (f"{label}_dot", 0.0), (f"{label}_bar", 0.0)):
+                self._unsaid[name] = wp.full(layout.members, number, layout.precision.real, layout.device)
         self.lifts = lift_kernels(layout.precision)
         self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
 
@@ -330,11 +321,6 @@ class Contacts:
                 found[f"{way}{label}{suffix}"] = value
         return found
 
-    def given(self, number: int, each: Sequence[FreeBody | Changes]) -> Arrays:
-        """Return the momenta of the two solids, or the tangents or adjoints of the momenta."""
-        touching = self.contacts[number].touching
-        return given_to(each, touching.body, touching.other)
-
     def look(self, step: StepContext) -> None:
         step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
@@ -343,7 +329,7 @@ class Contacts:
             for place in contact.places:
                 step.launch(self.kernels.look, place, *self.known(step, number), threads=contact.all)
             step.launch(self.kernels.push.forward, shares.each, *self.known(step, number), threads=contact.all)
-            self._sums[number], given = shares.sums(), self.given(number, self.part.bodies)
+            self._sums[number], given = shares.sums(), contact.given(self.part.bodies)
             step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
 
     def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
@@ -366,7 +352,7 @@ class ContactsTangent:
             known = contacts.numbers(dot.parameters, number, "_dot"), *contacts.known(step, number)
             all_points = contacts.contacts[number].all
             step.launch(contacts.kernels.push.tangent, shares.each, self._lift, *known, threads=all_points)
-            moved = contacts.given(number, self._changes), shares.sums()
+            moved = contacts.contacts[number].given(self._changes), shares.sums()
             step.launch(contacts.kernels.give.tangent, *moved, *known, threads=members)
 
 
@@ -390,7 +376,7 @@ class ContactsAdjoint:
         for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
             numbers = contacts.numbers(bar.parameters, number, "_bar")
             known = (self._sums, *contacts.known(step, number))
-            given = contacts.given(number, self._changes)
+            given = contact.given(self._changes)
             step.launch(contacts.kernels.give.adjoint, given, numbers, *known, threads=members)
             step.launch(contacts.kernels.push.adjoint, moved.each, *known, threads=contact.all)
             bars = moved.sums()

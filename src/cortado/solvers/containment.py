@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from cortado.device.launching import HostCopy, KernelLauncher
+from cortado.device.launching import HostCopy, KernelLauncher, Named
 from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.discretise.room import TOLERANCE
@@ -196,14 +196,30 @@ class Containment:
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
         """Prepare the search. Particles from ``first_waiting`` on may be moved by an emitter or a drain."""
-        self.walled, self._precision, self._launch = walled, layout.precision, launch
-        self._kernel = lost_kernel(layout.precision)
-        members, device = layout.members, layout.device
-        self._obstacles = (*walled.solids, *walled.moving)
-        self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in self._obstacles]
-        self._poses = pose_arrays(members, 0, layout.precision, device) if moving is None else moving.named
+        precision, members, device = layout.precision, layout.members, layout.device
+        self.walled, self._precision, self._launch = walled, precision, launch
+        self._kernel, vector, obstacles = lost_kernel(precision), precision.vector_of, (*walled.solids, *walled.moving)
+        self._meshes = [obstacle_mesh(one, walled.spacing, device) for one in obstacles]
+        self._poses = pose_arrays(members, 0, precision, device) if moving is None else moving.named
+        solids, middles = solids_type(precision)(), [middle_of(one) for one in obstacles]
+        places = padded(np.array(middles)) if middles else np.zeros((0, 3))
+        sides, tolerances = [-1.0 if one.is_hollow else 1.0 for one in obstacles], [*map(walled.tolerance, obstacles)]
+        solids.meshes = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device=device)
+        solids.middles = wp.array(places, dtype=precision.vector, device=device)
+        solids.sides = wp.array(sides, dtype=precision.real, device=device)
+        solids.tolerances = wp.array(tolerances, dtype=precision.real, device=device)
+        for name in ("before", "turns_before", "after", "turns", "scales"):
+            setattr(solids, name, self._poses[name])
+        solids.reach, solids.still, solids.period = REACH * walled.spacing, len(walled.solids), vector(walled.periods)
+        solids.frequency = vector([1.0 / length if length else 0.0 for length in walled.periods])
+        region, furthest, tolerance = walled.region, walled.furthest(precision), TOLERANCE * walled.spacing
+        bounds, up = bounds_type(precision)(), np.isfinite(region.rim) * (1.0 - region.across)
+        bounds.lower, bounds.upper = vector(region.lower - tolerance), vector(region.upper + tolerance)
+        bounds.base, bounds.across, bounds.up = vector(region.base), vector(region.across), vector(up)
+        bounds.radius, bounds.rim = region.radius + tolerance, region.rim
+        bounds.nearest, bounds.furthest = vector(furthest.lower), vector(furthest.upper)
         self._constants: dict[str, Any] = {"particles": layout.particles, "first_waiting": first_waiting}
-        self._constants |= {"bounds": self._made_bounds(), "solids": self._made_solids(device)}
+        self._constants |= {"bounds": bounds, "solids": solids}
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
         """First step with a lost particle in each scene, or -1 (members,)."""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
@@ -221,13 +237,10 @@ class Containment:
             else:
                 array.fill_(well)
 
-    def look(
-        self, order: wp.array, x_before: wp.array, rho_0: wp.array, x_free: wp.array, v_free: wp.array, state: State
-    ) -> None:
-        """Find lost particles at the end of a step. ``order``, ``x_before`` and ``rho_0`` are from before the step.
-        ``x_free`` and ``v_free`` are the new positions and velocities without emitters and drains. ``state`` is the new
-        state."""
-        known = {"order": order, "x_before": x_before, "rho_0": rho_0, "x_free": x_free, "v_free": v_free}
+    def look(self, known: Named, state: State) -> None:
+        """Find lost particles at the end of a step. ``known`` has ``order``, ``x_before`` and ``rho_0`` from before the
+        step, and the new positions ``x_free`` and velocities ``v_free`` without emitters and drains. ``state`` is the
+        new state."""
         found = {"bad_step": self.bad_step, "bad": self.bad_particle, "count": self._count}
         self._launch(self._kernel, self._constants, known, found, x=state.positions)
 
@@ -251,8 +264,9 @@ class Containment:
             return "has no finite position"
         if not self.walled.region.contains(position[None], TOLERANCE * self.walled.spacing)[0]:
             return f"left the container and was at {place}"
-        if name := self._entered(position):
-            return f"entered the solid {name!r} and was at {place}"
+        for one, distance in self._solids(0):
+            if distance(position[None])[0] < -self.walled.tolerance(one):
+                return f"entered the solid {one.name!r} and was at {place}"
         if self.is_imprecise(position):
             limit = f"{self._precision.furthest:g} spacings from the origin"
             return f"was at {place}, further than positions are precise in {self._precision.name}, {limit}"
@@ -267,49 +281,11 @@ class Containment:
         for one, distance in self._solids(member):
             yield f"the solid {one.name!r}", distance
 
-    def _entered(self, position: np.ndarray) -> str | None:
-        for one, distance in self._solids(0):
-            if distance(position[None])[0] < -self.walled.tolerance(one):
-                return one.name
-        return None
-
     def _solids(self, member: int) -> Iterator[tuple[Obstacle, Distance]]:
         yield from ((one, one.solid.distance) for one in self.walled.solids)
         poses = (self._poses[name].numpy()[member] for name in ("after", "turns", "scales"))
         for one, *pose in zip(self.walled.moving, *poses, strict=True):
             yield one, partial(_moved_distance, one, *pose)
-
-    def _made_solids(self, device: wp.Device) -> Any:
-        precision, walled = self._precision, self.walled
-        solids, middles = solids_type(precision)(), [middle_of(one) for one in self._obstacles]
-        places = padded(np.array(middles)) if middles else np.zeros((0, 3))
-        periods = padded(walled.periods[None])[0]
-        solids.meshes = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device=device)
-        solids.middles = wp.array(places, dtype=precision.vector, device=device)
-        sides = [-1.0 if one.is_hollow else 1.0 for one in self._obstacles]
-        solids.sides = wp.array(sides, dtype=precision.real, device=device)
-        tolerances = [walled.tolerance(one) for one in self._obstacles]
-        solids.tolerances = wp.array(tolerances, dtype=precision.real, device=device)
-        for name in ("before", "turns_before", "after", "turns", "scales"):
-            setattr(solids, name, self._poses[name])
-        solids.reach, solids.still = REACH * walled.spacing, len(walled.solids)
-        solids.period = precision.vector(*periods)
-        solids.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
-        return solids
-
-    def _made_bounds(self) -> Any:
-        precision, region, tolerance = self._precision, self.walled.region, TOLERANCE * self.walled.spacing
-        furthest, up = self.walled.furthest(precision), np.isfinite(region.rim) * (1.0 - region.across)
-        bounds = bounds_type(precision)()
-
-        def vector(values: np.ndarray) -> Any:
-            return precision.vector(*padded(values[None])[0])
-
-        bounds.lower, bounds.upper = vector(region.lower - tolerance), vector(region.upper + tolerance)
-        bounds.base, bounds.across, bounds.up = vector(region.base), vector(region.across), vector(up)
-        bounds.radius, bounds.rim = region.radius + tolerance, region.rim
-        bounds.nearest, bounds.furthest = vector(furthest.lower), vector(furthest.upper)
-        return bounds
 
 
 def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: float, points: Points) -> Points:
@@ -329,11 +305,7 @@ def shut_in(containment: Containment, member: int, points: Points) -> str | None
     """Return the names of walls with too narrow a gap at the points (n, d) [m] after the last step, or None."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
-    near = [
-        (name, distance, distances)
-        for name, distance in containment.walls(member)
-        if ((distances := distance(points)) < NARROW * spacing).any()
-    ]
+    near = [(name, one, d) for name, one in containment.walls(member) if ((d := one(points)) < best).any()]
     for (name, one, d), (other, two, e) in combinations(near, 2):
         narrow = np.flatnonzero(d + e < best)
         x = points[narrow]

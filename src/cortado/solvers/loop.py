@@ -1,6 +1,5 @@
 """Iterations within a time step that end when the errors are small enough. Kernels decide when to stop."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -24,25 +23,11 @@ UNKNOWN = 2**31 - 1
 """Number of iterations of a loop that has not ended."""
 
 
-@dataclass(frozen=True)
-class Measure:
-    """A reduction of the errors of all particles to one or two numbers per step."""
-
-    columns: tuple[str, ...]
-    """Names of the reduced numbers in diagnostics."""
-    is_weighted: bool
-    """True for a weighted root mean square, False for average and maximum."""
-
-
-AVERAGE = Measure(("{}", "greatest_{}"), is_weighted=False)
-ROOT_MEAN_SQUARE = Measure(("{}",), is_weighted=True)
-
-
 @cache
-def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> SimpleNamespace:
+def convergence_kernels(precision: Precision, weighted: bool = False) -> SimpleNamespace:
     """Make the kernels that count and stop iterations."""
     real, pair = precision.real, precision.pair
-    module = kernel_module(f"convergence_{precision.name}{'_weighted' * measure.is_weighted}")
+    module = kernel_module(f"convergence_{precision.name}{'_weighted' * weighted}")
 
     @wp.func
     def average_and_maximum(sums: pair, particles: int) -> pair:
@@ -55,8 +40,7 @@ def convergence_kernels(precision: Precision, measure: Measure = AVERAGE) -> Sim
             mean = sums[0] / sums[1]
         return pair(wp.sqrt(mean), real(0.0))
 
-    reached = root_of_mean if measure.is_weighted else average_and_maximum
-
+    reached = root_of_mean if weighted else average_and_maximum
     typed = TypesByName(real, {pair: "sums", wp.int32: "iteration rounds active bad step count"})
 
     @typed.kernel(module)
@@ -131,141 +115,93 @@ class LoopLimits:
     """Upper bound on the error of every particle; may be infinite."""
 
 
-class StepRecord(ABC):
-    """Arrays (steps, members) on the device with numbers of a loop or a solve for each step."""
+class StepRecord:
+    """Numbers of a loop or of a force's solve for each step."""
 
-    def __init__(self, steps: int, layout: Layout, *kinds: Any):
-        """Allocate an array of iterations, and arrays of the Warp types ``kinds``."""
-        shape = (max(steps, 1), layout.members)
-        self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in (wp.int32, *kinds)]
+    def __init__(self, steps: int, layout: Layout, name: str, columns: Sequence[str] = ()):
+        """Allocate room for ``steps`` steps. ``name`` and ``columns`` are names of iterations and errors in
+        diagnostics."""
+        shape, kinds = (max(steps, 1), layout.members), (wp.int32, layout.precision.pair)
+        self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in kinds[: 2 if columns else 1]]
+        """Iterations, and with ``columns`` errors, on the device (steps, members)."""
         self.copies, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
+        self._name, self._columns = name, columns
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Take the first ``steps`` steps as the steps of the last run. They are read when they are asked for."""
-        self.steps, self._diagnostics = steps, None
+        """Take the first ``steps`` steps as the last run. Their numbers are read from the device when needed."""
+        self._steps = steps
+        self._diagnostics: dict[str, NDArray] | None = None
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
-        """Return the diagnostics by name (steps,), in a batch (steps, batch)."""
+        """Return the diagnostics of the last run by name (steps,), in a batch (steps, batch)."""
         if self._diagnostics is None:
-            found = [copy.read(self.steps) for copy in self.copies]
-            self._diagnostics = self._named(*(array[:, 0] if self._batch is None else array for array in found))
+            found = [copy.read(self._steps) for copy in self.copies]
+            iterations, *errors = [array[:, 0] for array in found] if self._batch is None else found
+            named = {name: errors[0][..., number].astype(np.float64) for number, name in enumerate(self._columns)}
+            self._diagnostics = {self._name: iterations.astype(int), **named}
         return self._diagnostics
 
-    _diagnostics: dict[str, NDArray] | None
+    @property
+    def counts(self) -> NDArray:
+        """Return the number of iterations of each step (steps,). In a batch it is the greatest number of all scenes."""
+        return self.copies[0].read(self._steps).max(axis=1)
 
-    @abstractmethod
-    def _named(self, iterations: NDArray, *others: NDArray) -> dict[str, NDArray]:
-        """Return diagnostics by name from the numbers of the last run."""
-
-    @abstractmethod
-    def is_calm(self, limits: Mapping[str, float]) -> bool:
-        """Test if all steps have converged, without columns above the given limits."""
+    def is_within(self, limits: Mapping[str, float]) -> bool:
+        """Test if no diagnostics of the last run exceed their ``limits`` by name, and none of these are NaN."""
+        columns = {
+            name: self.copies[1].read(self._steps)[..., k] for k, name in enumerate(self._columns) if name in limits
+        }
+        if self._name in limits:
+            columns[self._name] = self.copies[0].read(self._steps)
+        return all(bool((column <= limits[name]).all()) for name, column in columns.items())
 
     def assign(self, other: Self) -> None:
         for own, given, copy in zip(self.arrays, other.arrays, self.copies, strict=True):
             wp.copy(own, given)
             copy.is_fetched = False
-        self.read(other.steps)
-
-
-class SolveRecord(StepRecord):
-    """Numbers of iterations of a force's solve in each step."""
-
-    def __init__(self, steps: int, solve: IterativeSolve, layout: Layout):
-        super().__init__(steps, layout)
-        self.solve, self._note = solve, convergence_kernels(layout.precision).note
-
-    def _named(self, iterations: NDArray, *others: NDArray) -> dict[str, NDArray]:
-        return {self.solve.name: iterations.astype(int)}
-
-    def is_calm(self, limits: Mapping[str, float]) -> bool:
-        return not (self.copies[0].read(self.steps) > limits.get(self.solve.name, np.inf)).any()
-
-    def note(self, launch: KernelLauncher, step: wp.array) -> None:
-        """Record the number of iterations of a solve. ``step`` is the number of the step in each scene."""
-        (iterations,) = self.arrays
-        launch(self._note, count=self.solve.count, step=step, iterations=iterations, threads=iterations.shape[1])
-
-
-class LoopRecord(StepRecord):
-    """Numbers of iterations and errors of a loop in each step."""
-
-    def __init__(self, steps: int, loop: "Loop"):
-        self.loop = loop
-        super().__init__(steps, loop.layout, loop.layout.precision.pair)
-
-    def _named(self, iterations: NDArray, *others: NDArray) -> dict[str, NDArray]:
-        (errors,) = others
-        found = {name: errors[..., number].astype(np.float64) for number, name in enumerate(self.loop.columns)}
-        return {self.loop.iterations_name: iterations.astype(int), **found}
-
-    @property
-    def counts(self) -> NDArray:
-        """Return the number of iterations of each step (steps,). In a batch it is the greatest number of all scenes."""
-        return self.copies[0].read(self.steps).max(axis=1)
-
-    @property
-    def _bounds(self) -> tuple[float, ...]:
-        limits = self.loop.limits
-        if limits is None or limits.minimum_iterations == limits.maximum_iterations:
-            return ()
-        return limits.tolerance, limits.greatest_tolerance
-
-    @property
-    def converged(self) -> NDArray:
-        """Test for each step if the errors are within the tolerances, (steps,) or (steps, batch)."""
-        found = [self.diagnostics[name] for name in self.loop.columns]
-        columns = [column <= bound for column, bound in zip(found, self._bounds, strict=False)]
-        return np.logical_and.reduce([np.ones(found[0].shape, dtype=bool), *columns])
-
-    def is_calm(self, limits: Mapping[str, float]) -> bool:
-        wanted = [limits.get(name, np.inf) for name in self.loop.columns]
-        bounds = [min(pair) for pair in zip(wanted, (*self._bounds, np.inf, np.inf), strict=False)]
-        errors = self.copies[1].read(self.steps)
-        return all(bool((errors[..., k] <= bound).all()) for k, bound in enumerate(bounds) if bound < np.inf)
+        self.read(other._steps)
 
 
 class IterationLog:
     """A `StepLog` of loops and of the solves of forces."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
-        self.loops = tuple(LoopRecord(steps, loop) for loop in loops)
-        self.solves = tuple(SolveRecord(steps, solve, layout) for solve in solves)
-        self.records: tuple[StepRecord, ...] = (*self.loops, *self.solves)
-        self._steps, self._layout = 0, layout
+        self.loops = [(loop, StepRecord(steps, layout, loop.iterations_name, loop.columns)) for loop in loops]
+        self.solves = [(solve, StepRecord(steps, layout, solve.name)) for solve in solves]
+        self._records, self._steps, self._layout = [one for _, one in (*self.loops, *self.solves)], 0, layout
+        self.copies = [copy for record in self._records for copy in record.copies]
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
         scenes = () if self._layout.batch is None else (self._layout.batch,)
         found, converged = dict[str, NDArray](), np.ones((self._steps, *scenes), dtype=bool)
-        for record in self.records:
+        for record in self._records:
             found |= record.diagnostics
-        for loop in self.loops:
-            converged &= loop.converged
+        for loop, _ in self.loops:
+            for name, bound in loop.bounds.items():
+                converged &= found[name] <= bound
         return {**found, "converged": converged}
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
-        """Test if all loops have converged in all steps, without diagnostics above the given ``limits`` by name."""
-        return all(record.is_calm(limits) for record in self.records)
-
-    @property
-    def copies(self) -> list[HostCopy]:
-        return [copy for record in self.records for copy in record.copies]
+        own = dict(limits)
+        for loop, _ in self.loops:
+            own |= {name: min(bound, own.get(name, np.inf)) for name, bound in loop.bounds.items() if bound < np.inf}
+        return all(record.is_within(own) for record in self._records)
 
     def read(self, steps: int) -> None:
         self._steps = steps
-        for record in self.records:
+        for record in self._records:
             record.read(steps)
 
     def assign(self, other: "IterationLog") -> None:
         self._steps = other._steps
-        for own, given in zip(self.records, other.records, strict=True):
+        for own, given in zip(self._records, other._records, strict=True):
             own.assign(given)
 
     def seek(self, step: int) -> Counts:
-        return tuple(record.loop.seek(record, step) for record in self.loops)
+        return tuple(loop.seek(record, step) for loop, record in self.loops)
 
 
 class Loop:
@@ -278,36 +214,41 @@ class Loop:
         launch: KernelLauncher,
         iterations_name: str = "iterations",
         errors_name: str = "density_errors",
-        measure: Measure = AVERAGE,
+        weighted: bool = False,
     ):
-        """Prepare a loop. With ``limits`` None it has no iterations. The names appear in diagnostics."""
+        """Prepare a loop. With ``limits`` None it has no iterations. The names appear in diagnostics. The errors of all
+        particles are reduced to a weighted root mean square, or to average and maximum."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
-        self.columns = [column.format(errors_name) for column in measure.columns]
+        self.columns = [errors_name] if weighted else [errors_name, f"greatest_{errors_name}"]
+        """Names of the reduced errors in diagnostics."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
         """Errors of each particle in the last iteration, as pairs of numbers (n,)."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
         """Number of iterations of each scene (members,), or `UNKNOWN` while the loop runs. Scenes that have ended must
         not change in later iterations."""
-        self._launch, self._kernels = launch, convergence_kernels(precision, measure)
-        self._sum = (
-            layout.sum_of(precision.pair)
-            if measure.is_weighted
-            else sum_and_maximum(layout.particles, precision, device, layout.members)
-        )
+        self._launch, self._kernels = launch, convergence_kernels(precision, weighted)
+        size = layout.particles, precision, device, layout.members
+        self._sum = layout.sum_of(precision.pair) if weighted else sum_and_maximum(*size)
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
         """Fixed number of iterations, or 0."""
+        self.bounds: dict[str, float] = {}
+        """Bounds on the reduced errors of a step that has converged, by name. A fixed number of iterations has none."""
+        if limits is not None and not is_fixed:
+            self.bounds = dict(zip(self.columns, (limits.tolerance, limits.greatest_tolerance), strict=False))
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self._active = wp.full(1, layout.members, dtype=wp.int32, device=device)
+        self._known: dict[str, Any] = {"iteration": self._iteration, "rounds": self.rounds, "active": self._active}
+        self._known["particles"] = layout.particles
 
     def reset(self) -> None:
         self._iteration.zero_()
         self.rounds.fill_(UNKNOWN)
         self._active.fill_(self.layout.members)
 
-    def seek(self, record: LoopRecord, step: int) -> int:
+    def seek(self, record: StepRecord, step: int) -> int:
         """Prepare the loop to repeat a recorded step, and return its number of iterations."""
         if self.layout.members > 1:
             wp.copy(self.rounds, record.arrays[0][step])
@@ -324,28 +265,26 @@ class Loop:
             iterate(k)
         with self._launch.aside() if self._fixed else nullcontext():
             self._sums = self._sum(self.errors)
+        known: dict[str, Any] = {**self._known, "most": limits.maximum_iterations, "tolerance": limits.tolerance}
+        known["greatest_tolerance"] = limits.greatest_tolerance
+
+        def decide(done: int) -> None:
+            self._launch(self._kernels.decide, known, done=done, sums=self._sums, threads=self.layout.members)
+
+        def once_more() -> None:
+            iterate(limits.maximum_iterations)
+            self._sums = self._sum(self.errors)
+            decide(1)
+
         if limits.maximum_iterations > limits.minimum_iterations:
-            self._decide(limits, limits.minimum_iterations)
-
-            def once_more() -> None:
-                iterate(limits.maximum_iterations)
-                self._sums = self._sum(self.errors)
-                self._decide(limits, 1)
-
+            decide(limits.minimum_iterations)
             wp.capture_while(self._active, once_more)
 
-    def note(self, record: LoopRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
+    def note(self, record: StepRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
         """Record the iterations and errors of this step."""
         self._launch.join()
         iterations, errors = record.arrays
-        known = {"iteration": self._iteration, "rounds": self.rounds, "active": self._active, "sums": self._sums}
-        known |= {"bad": containment.bad_particle, "bad_step": containment.bad_step, "step": step_number}
-        known |= {"iterations": iterations, "errors": errors, "particles": self.layout.particles}
+        own = {"bad": containment.bad_particle, "bad_step": containment.bad_step, "step": step_number}
+        own |= {"iterations": iterations, "errors": errors, "sums": self._sums}
         numbers = {"undecided": self._fixed, "is_last": int(is_last)}
-        self._launch(self._kernels.record, known, **numbers, threads=self.layout.members)
-
-    def _decide(self, limits: LoopLimits, done: int) -> None:
-        known = {"iteration": self._iteration, "rounds": self.rounds, "active": self._active, "sums": self._sums}
-        known |= {"most": limits.maximum_iterations, "particles": self.layout.particles, "done": done}
-        known |= {"tolerance": limits.tolerance, "greatest_tolerance": limits.greatest_tolerance}
-        self._launch(self._kernels.decide, known, threads=self.layout.members)
+        self._launch(self._kernels.record, self._known, own, **numbers, threads=self.layout.members)

@@ -134,14 +134,10 @@ class FlatFaces:
     def behind(self, solid: Numbers, positions: Points, feet: Points, near: float) -> Numbers:
         """Return the number of the face above each wall particle (b,), or -1. ``near`` [m] is a tolerance."""
         found = np.full(len(solid), -1)
-        for number, (own, place, frame, size) in enumerate(
-            zip(self.solids, self.places, self.frames, self.sizes, strict=True)
-        ):
+        for number, (place, frame, size) in enumerate(zip(self.places, self.frames, self.sizes, strict=True)):
             at, foot = (positions + feet - place) @ frame.T, feet @ frame.T
-            on = (
-                (np.abs(at) <= size + near).all(axis=1) & (np.abs(foot[:, 1:]) <= near).all(axis=1) & (foot[:, 0] > 0.0)
-            )
-            found[on & (solid == own)] = number
+            on = (solid == self.solids[number]) & (np.abs(at) <= size + near).all(axis=1)
+            found[on & (np.abs(foot[:, 1:]) <= near).all(axis=1) & (foot[:, 0] > 0.0)] = number
         return found
 
 
@@ -213,7 +209,6 @@ def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> D
     if (furthest := np.abs(fluid.places).max() / spacing) > precision.furthest:
         raise InputError(
             f"The drains would store drained particles as far as {furthest:.3g} spacings of {spacing:g} m from the "
-            "origin, "
-            f"but must stay within {precision.furthest:g} in {precision.name}: take another precision."
+            f"origin, but must stay within {precision.furthest:g} in {precision.name}: take another precision."
         )
     return Drained(mouths, pulls, fluid.places, nozzles_of(scene, discrete), discrete.periods)

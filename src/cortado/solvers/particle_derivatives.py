@@ -73,14 +73,10 @@ class ParticleAdjoint:
         names = ["time_step", *of_parts, *solver.shares, *of_forces]
         self._solver = solver
         self._parts = [part.new_adjoint() for part in reversed(solver.parts)]
-        self.bar = Adjoints(
-            Fields.zeros(layout.all_particles, layout.precision, layout.device),
-            solver.new_fractions(),
-            solver.new_parameters(steps),
-            Shares(names, layout),
-            SolidShares(solver.search.moving, layout),
-            [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies],
-        )
+        fields = Fields.zeros(layout.all_particles, layout.precision, layout.device)
+        shares = Shares(names, layout), SolidShares(solver.search.moving, layout)
+        bodies = [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies]
+        self.bar = Adjoints(fields, solver.new_fractions(), solver.new_parameters(steps), *shares, bodies)
         """Adjoints of a step. Call `collect` for the adjoints of parameters."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Adjoints of the solver's state fields, after `unsort`."""

@@ -38,8 +38,6 @@ class ParticleSystem:
     lattice: Lattice
     search: NeighbourSearch
     forces: Sequence[Force]
-    periods: Sequence[float]
-    """Lengths of the periodic box (3,) [m]; 0 along an axis that is not periodic."""
     parts: Sequence[PartMaker]
     waiting: int
     """Index of the first particle that an emitter or a drain may move."""
@@ -192,10 +190,8 @@ class ParticleSolver(Staying):
     def context(self, parameters: Parameters) -> StepContext:
         if self._context is None or self._context.parameters is not parameters:
             order, step, particles = self.search.order, self.step_number, self.layout.particles
-            own = (self.launch, particles, self._neighbourhood, order, step, self.lattice.cell)
-            self._context = StepContext(
-                *own, self.fields, self.fractions, parameters, self.free, self.kick_of(self.carried)
-            )
+            own = self.launch, particles, self._neighbourhood, order, step, self.lattice.cell, self.fields
+            self._context = StepContext(*own, self.fractions, parameters, self.free, self.kick_of(self.carried))
         return self._context
 
     def sort(self, state: State, parameters: Parameters) -> StepContext:
@@ -240,15 +236,17 @@ class ParticleSolver(Staying):
         """Find lost particles, record the loops, and count the step. ``x`` and ``v`` are positions and velocities of
         sorted particles."""
         f, containment = self.fields, self.containment
-        containment.look(self.search.order, f["x"], f["rho_0"], x, v, new_state)
-        for solve in log.solves:
-            solve.note(self.launch, self.step_number)
-        for k, (loop, record) in enumerate(zip(self.loops, log.loops, strict=True), 1):
-            loop.note(record, containment, self.step_number, is_last=k == len(self.loops))
+        before = {"order": self.search.order, "x_before": f["x"], "rho_0": f["rho_0"]}
+        containment.look({**before, "x_free": x, "v_free": v}, new_state)
+        kernels, each = convergence_kernels(self.discretisation.precision), {"threads": self.layout.members}
+        for solve, record in log.solves:
+            counts = {"count": solve.count, "iterations": record.arrays[0]}
+            self.launch(kernels.note, counts, step=self.step_number, **each)
+        for loop, record in log.loops:
+            loop.note(record, containment, self.step_number, is_last=loop is self.loops[-1])
         if not self.loops:
-            count_step = convergence_kernels(self.discretisation.precision).count_step
             bad = {"bad": containment.bad_particle, "bad_step": containment.bad_step}
-            self.launch(count_step, bad, step=self.step_number, threads=self.layout.members)
+            self.launch(kernels.count_step, bad, step=self.step_number, **each)
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
         """Return the densities (n,) [kg / m3] of a state in scene order. A batch returns the scenes one after the
@@ -260,7 +258,9 @@ class ParticleSolver(Staying):
         self.sort(state, parameters)
         while self.make_room():
             self.sort(state, parameters)
-        return self.in_scene_order(self.fields["m"].numpy() * self.fields["n"].numpy())
+        found = np.empty(self.layout.all_particles)
+        found[self.search.order.numpy()[: len(found)]] = self.fields["m"].numpy() * self.fields["n"].numpy()
+        return found
 
     def pressures(self) -> wp.array | None:
         """Return the pressures (n,) [Pa] of sorted particles on walls in the last step, or None without pressure."""
@@ -269,12 +269,6 @@ class ParticleSolver(Staying):
     def stresses(self) -> wp.array | None:
         """Return the pressures (n,) [Pa] of sorted particles for pressure sensors."""
         return self.pressures()
-
-    def in_scene_order(self, values: NDArray) -> NDArray:
-        """Return values (n,) of sorted particles in scene order. A batch returns the scenes one after the other."""
-        found = np.empty(self.layout.all_particles)
-        found[self.search.order.numpy()[: len(found)]] = values
-        return found
 
     # ---- derivatives ---------------------------------------------------------------------------------------------
 
@@ -291,12 +285,12 @@ class ParticleSolver(Staying):
         raise MissingDerivativeError(f"{self.system.called} has no {what}: {advice}, or another solver.")
 
     def gradient_memory(self, log: IterationLog) -> dict[str, float]:
-        iterations = sum(int(record.counts.max(initial=0)) for record in log.loops)
+        iterations = sum(int(record.counts.max(initial=0)) for _, record in log.loops)
         return gradient_parts(self.layout.all_particles, iterations, self.discretisation.precision.bytes)
 
 
 def _neighbourhood(system: ParticleSystem) -> Any:
-    search, lattice, periods, precision = system.search, system.lattice, system.periods, system.discretisation.precision
+    search, lattice, precision, periods = system.search, system.lattice, system.layout.precision, system.walled.periods
     s = neighbourhood_type(precision)()
     s.particles = system.layout.particles
     s.neighbours, s.fluid_count = search.neighbours, search.fluid_count
@@ -314,8 +308,8 @@ def _neighbourhood(system: ParticleSystem) -> Any:
         setattr(s, f"face_{name}", wp.array(getattr(faces, name), dtype=kind, device=system.layout.device))
     for name, array in {} if search.moving is None else search.moving.named.items():
         setattr(s, name, array)
-    s.period = precision.vector(*periods)
-    s.frequency = precision.vector(*(1.0 / length if length else 0.0 for length in periods))
+    s.period = precision.vector_of(periods)
+    s.frequency = precision.vector_of([1.0 / length if length else 0.0 for length in periods])
     for name, entry in s._cls.vars.items():
         if isinstance(entry.type, wp.array) and getattr(s, name) is None:  # a tape looks at each
             none = wp.empty((0,) * entry.type.ndim, dtype=entry.type.dtype, device=system.layout.device)

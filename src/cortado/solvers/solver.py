@@ -3,7 +3,7 @@
 Rollouts, gradients, files and reports of runs use a solver only through this protocol.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -15,7 +15,7 @@ from cortado.device.threads import Turn
 from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.state import Fields, Layout, Parameters, State
 from cortado.solvers.containment import Containment
-from cortado.sph.parts import StepContext, Tangents
+from cortado.sph.parts import StepContext
 
 Counts = tuple[int, ...]
 """Numbers of iterations of each loop in a step. A step with given numbers can be repeated exactly."""
@@ -53,14 +53,23 @@ class StepLog(Protocol):
 
 
 class StepTangent(Protocol):
-    """Protocol of the tangent of a repeated step (forward mode)."""
+    """Protocol of the tangent of a repeated step (forward mode).
+
+    A solver with pressures also has the `Tangents` ``dot``, and the methods ``pressures(rounds)`` and
+    ``stresses(rounds)``. They return the tangents (n,) of the pressures of sorted particles [Pa], on walls and for
+    pressure sensors. ``rounds`` are the numbers of pressure iterations of the scenes.
+    """
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         """Update ``state_dot`` from the tangent before the repeated step to the tangent after the step."""
 
 
 class StepAdjoint(Protocol):
-    """Protocol of the adjoint of a repeated step (reverse mode)."""
+    """Protocol of the adjoint of a repeated step (reverse mode).
+
+    A solver with pressures also has the method ``from_within(counts, within, state_bar, parameters)``. It writes to
+    ``state_bar`` the adjoint of the state before the repeated step, given the adjoints `WithinBar` within the step.
+    """
 
     def begin(self) -> None:
         """Set the adjoints of the parameters to 0."""
@@ -70,19 +79,6 @@ class StepAdjoint(Protocol):
 
     def collect(self) -> Parameters:
         """Return the adjoints of the parameters, summed over all steps since `begin`."""
-
-
-class PressureTangent(StepTangent, Protocol):
-    """Protocol of the tangent of a solver with pressures."""
-
-    dot: Tangents
-
-    def pressures(self, rounds: Sequence[int]) -> NDArray:
-        """Return the tangents (n,) of the pressures of sorted particles on walls in the last step [Pa]. ``rounds`` are
-        the numbers of pressure iterations of the scenes."""
-
-    def stresses(self, rounds: Sequence[int]) -> NDArray:
-        """Return the tangents (n,) of the pressures of sorted particles for pressure sensors [Pa]."""
 
 
 @dataclass(frozen=True)
@@ -96,14 +92,6 @@ class WithinBar:
     """Adjoint of the pressures for pressure sensors (n,), or None."""
     v_star: wp.array
     """Adjoint of the velocities after explicit forces (n,)."""
-
-
-class PressureAdjoint(StepAdjoint, Protocol):
-    """Protocol of the adjoint of a solver with pressures."""
-
-    def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        """Write to ``state_bar`` the adjoint of the state before the repeated step, given the adjoints ``within`` the
-        step."""
 
 
 class Solver(Protocol):

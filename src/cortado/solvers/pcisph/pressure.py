@@ -32,8 +32,7 @@ from cortado.sph.parts import prediction_share
 @cache
 def pressure_kernels(discretisation: Discretisation) -> Kernels:
     (real, vector, neighbourhood), pair_of = discretisation.types, discretisation.precision.pair
-    sums = density_sums(discretisation)
-    weights, weights_tangent, weights_adjoint = sums.forward, sums.tangent, sums.adjoint
+    weights, weights_tangent, weights_adjoint = density_sums(discretisation)
     values = bundle(n=real, m=real, rho_0=real, y=real, p_in=real, p_out=real)
     changes = bundle(n=real, m=real, rho_0=real, y=real, p_in=real)
     adjoin_prediction = prediction_share(discretisation.precision)

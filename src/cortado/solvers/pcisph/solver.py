@@ -23,7 +23,7 @@ multiplied by response^(-1/2) before they are squared, because the square of a g
 spacings.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from math import inf
 from types import SimpleNamespace
@@ -141,27 +141,6 @@ def scaling_kernel(discretisation: Discretisation) -> Any:
     return scale_adjoint
 
 
-class Iterates:
-    """Predicted states and pressures of the iterations of a step. Without derivatives, only the latest iteration is
-    stored."""
-
-    def __init__(self, numbers: Callable[[], wp.array], vectors: Callable[[], wp.array]):
-        self._numbers, self._vectors = numbers, vectors
-        self.x_star: list[wp.array] = []
-        self.v_star: list[wp.array] = []
-        self.p: list[wp.array] = [numbers()]
-        """Pressures before each iteration. ``p[0]`` is always 0."""
-        self.c: list[wp.array] = []
-        self.reserve(1)
-
-    def reserve(self, iterations: int) -> None:
-        while len(self.x_star) <= iterations:
-            self.x_star.append(self._vectors())
-            self.v_star.append(self._vectors())
-            self.p.append(self._numbers())
-            self.c.append(self._numbers())
-
-
 class Pcisph(ParticleSolver):
     topic = "pcisph"
 
@@ -180,7 +159,10 @@ class Pcisph(ParticleSolver):
         y = self.numbers() if self.layout.phases > 1 else wall_y
         self.known: dict[str, Any] = {"wall_y": wall_y, "t": t, "y": y, "stiffness": self.lattice.stiffness}
         """Arrays of the relaxation factors, by names of kernel arguments."""
-        self.iterates = Iterates(self.numbers, self.vectors)
+        self.iterates = SimpleNamespace(x_star=[], v_star=[], p=[self.numbers()], c=[])
+        """Predicted states and pressures of the iterations of a step. Without derivatives, only the latest iteration is
+        stored. ``p`` has the pressures before each iteration; the first is always 0."""
+        Pcisph.reserve(self, (1,))
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
         self.known |= {"rounds": self.pressure_loop.rounds, "acceleration": self.accelerations[-1]}
@@ -192,8 +174,12 @@ class Pcisph(ParticleSolver):
         self.end_step(self.iterates.x_star[0], self.iterates.v_star[0], new_state, log)
 
     def reserve(self, counts: Counts) -> None:
-        (iterations,) = counts
-        self.iterates.reserve(iterations)
+        it = self.iterates
+        while len(it.x_star) <= counts[0]:
+            it.x_star.append(self.vectors())
+            it.v_star.append(self.vectors())
+            it.p.append(self.numbers())
+            it.c.append(self.numbers())
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)
@@ -253,34 +239,21 @@ class PcisphAdjoint(ParticleAdjoint):
         self._own = solver.layout.arrays(**numbers, **vectors)
         self._own["wall_y_bar"] = self._own["y_bar"]
 
-    def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        self._begin(counts, state_bar, parameters)
-        self._go_back(counts, state_bar, parameters)
-
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
         state_bar.clear()
-        self._begin(counts, state_bar, parameters)
-        add(within.p, self._own["p_bar"])
-        if within.stress is not None:
-            add(within.stress, self._own["p_bar"])
-        self._go_back(counts, state_bar, parameters, within)
+        self.step(counts, state_bar, parameters, within)
 
-    def _begin(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        (iterations,) = counts
-        solver = self._solver
-        context = solver.context(parameters)
-        free_bar = self.unsort(context, state_bar)
-        self.begin_step(context, free_bar, solver.iterates.v_star[iterations])
-        context.launch(solver.kernels.scale_adjoint, *self.bar.named, self._own)
-        self._own["y_bar"].zero_()
-        self._own["p_bar"].zero_()
-
-    def _go_back(
-        self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
-    ) -> None:
+    def step(self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None) -> None:
         (iterations,) = counts
         solver, it, kernels, topic = self._solver, self._solver.iterates, self._solver.kernels, self._solver.topic
         context, known, own = solver.context(parameters), (self._own, *self.bar.named, solver.known), self._own
+        self.begin_step(context, self.unsort(context, state_bar), it.v_star[iterations])
+        context.launch(kernels.scale_adjoint, *self.bar.named, own)
+        own["y_bar"].zero_()
+        own["p_bar"].zero_()
+        for given in () if within is None else (within.p, within.stress):
+            if given is not None:
+                add(given, own["p_bar"])
         pushed = partial(solid_kernel, solver.discretisation, "pcisph", pressure_term, looped=True)
         densities = partial(density_solid_kernel, solver.discretisation, topic, looped=True)
         for k in reversed(range(iterations)):
@@ -340,7 +313,7 @@ class PcisphTangent(ParticleTangent):
     stresses = pressures
 
 
-class PcisphMaker:
+class Maker:
     batches = True
 
     def __init__(self, table: PcisphSolver):
@@ -351,6 +324,3 @@ class PcisphMaker:
         greatest = inf if table.maximum_density_tolerance is None else table.maximum_density_tolerance
         limits = LoopLimits(*counts, table.density_tolerance, greatest) if setting.scene.forces.pressure else None
         return Pcisph(particle_system(setting), limits)
-
-
-maker = PcisphMaker

@@ -16,7 +16,6 @@ this diagonal the body's part of the matrix has no eigenvalue above 2.
 """
 
 from copy import copy
-from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -49,8 +48,7 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
     pair_of, pair = precision.pair, pair_functions(discretisation)
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
     normal, typed = normal_part(discretisation), types_by_name(precision)
-    topic = "projection_bodies"
-    modules = module, tangent_module, adjoint_module = discretisation.modules(topic)
+    modules = module, tangent_module, adjoint_module = discretisation.modules("projection_bodies")
 
     @wp.func
     def between(a: vector, foot: vector, edge: real) -> vector:
@@ -119,7 +117,7 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
         measure=made(measure, ["sizes"]),
         weigh=made(weigh, ["a:a"], numbers=["pushed_volume", "greatest"], written=["sizes", "whole", "density"]),
         share=share,
-        pull=replace(made(pull, sums, summed=sums), tangent=pull_tangent),
+        pull=made(pull, sums, summed=sums)._replace(tangent=pull_tangent),
     )
 
 
@@ -146,13 +144,12 @@ class Held:
         self.body, self.given, self._layout = body, begun.given, layout
         self.start = {f"{name[0]}_0{name[1:]}": array for name, array in begun.before.items()}
         """Velocity, angular velocity and angular momentum of the body without pressures."""
-        precision, vector, device = layout.precision, layout.precision.vector, layout.device
+        precision, vector, size = layout.precision, layout.precision.vector, (layout.members, layout.precision.vector)
         self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
-        self.moved = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in "VWL"}
+        self.moved = zeros({f"{name}{suffix}": size for name in "VWL"}, layout.device)
         """Velocity, angular velocity and angular momentum of the body with the pressures of an iteration."""
-        names = ("faster", "turned_faster")
-        self.faster = {f"{name}{suffix}": wp.zeros(layout.members, dtype=vector, device=device) for name in names}
+        self.faster = zeros({f"{name}{suffix}": size for name in ("faster", "turned_faster")}, layout.device)
         """Changes of velocity and angular velocity by pressures."""
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
@@ -161,10 +158,9 @@ class Held:
 
     def at_rest(self) -> "Held":
         """Return a copy with the same arrays for a body at rest."""
-        other = copy(self)
-        vector, real = self._layout.precision.vector, self._layout.precision.real
-        kinds = {"V_0": vector, "W_0": vector, "L_0": vector, "time_step": real}
-        sizes = {f"{name}{self._suffix}": (self._layout.members, kind) for name, kind in kinds.items()}
+        other, precision, members = copy(self), self._layout.precision, self._layout.members
+        kinds = {**dict.fromkeys(("V_0", "W_0", "L_0"), precision.vector), "time_step": precision.real}
+        sizes = {f"{name}{self._suffix}": (members, kind) for name, kind in kinds.items()}
         other.start, other.given = zeros(sizes, self._layout.device), {}
         return other
 

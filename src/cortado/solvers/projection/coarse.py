@@ -15,7 +15,6 @@ from cortado.device.cells import CellSort
 from cortado.device.grid import Grid
 from cortado.device.launching import Named
 from cortado.device.precision import FLOAT32
-from cortado.particles.state import Layout
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_levels import Levels
@@ -55,11 +54,11 @@ class Coarse:
         self.pressure, self.length = coarse_pressure_kernels(precision, dimension), length_kernels(precision)
         self.velocity = velocity_kernels(discretisation, dimension)
         self._sort = CellSort(grid, layout.particles, precision, device, layout.members)
-        self._particles, self._kinds = layout, (real, vector, precision.pair)
+        self.layout = layout
         self._tolerance = CLOSE if precision is FLOAT32 else round_off(precision)
         self.bodies = None if bodies is None else CoarseBodies(bodies, layout, dimension)
         rows = 0 if self.bodies is None else self.bodies.rows
-        self._levels = Levels(precision, dimension, grid.shape, layout.members, device, rows)
+        self._levels = Levels(layout, dimension, grid.shape, rows)
         self._parts = wp.zeros((2**dimension, len(self._levels.r)), dtype=real, device=device)
         """Terms of the right-hand side by cell (corners, cells)."""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
@@ -82,9 +81,10 @@ class Coarse:
 
     def room(self) -> dict[str, wp.array]:
         """Allocate arrays for the results of a correction."""
-        layout, (real, vector, pair) = self._particles, self._kinds
-        kept = layout.arrays(r=real, change=real, thrust=vector)
-        return {**kept, "e": self.numbers(), "sums": wp.zeros(layout.members, dtype=pair, device=layout.device)}
+        layout, precision = self.layout, self.layout.precision
+        kept = layout.arrays(r=precision.real, change=precision.real, thrust=precision.vector)
+        kept["sums"] = wp.zeros(layout.members, dtype=precision.pair, device=layout.device)
+        return {**kept, "e": self.numbers()}
 
     def begin(self, context: StepContext, known: Named) -> None:
         """Compute the coarse matrix of a step."""
@@ -140,13 +140,11 @@ class Coarse:
 
 
 class CoarseTangent:
-    def __init__(self, coarse: Coarse, layout: Layout, bodies: BodiesTangent | None, known: tuple[Named, ...]):
-        precision = layout.precision
+    def __init__(self, coarse: Coarse, bodies: BodiesTangent | None, known: tuple[Named, ...]):
+        layout, precision = coarse.layout, coarse.layout.precision
         real, vector = precision.real, precision.vector
         self._coarse, self._e_dot, self._known = coarse, coarse.numbers(), known
-        self._bodies = None
-        if coarse.bodies is not None and bodies is not None:
-            self._bodies = CoarseBodiesTangent(coarse.bodies, bodies)
+        self._bodies = CoarseBodiesTangent(coarse.bodies, bodies) if coarse.bodies and bodies else None
         self._unmoved = {**coarse.unmoved, "carried_dot": coarse.unmoved["carried"]}
         self._pushed = {**coarse.pushed, **layout.arrays("_dot", h=vector, N=precision.matrix, T=precision.six)}
         self._dots = layout.arrays("_dot", r=real, change=real, thrust=vector)
@@ -168,9 +166,8 @@ class CoarseTangent:
         thrown = {**self._thrown, "y": new["change"], "y_dot": dots["change_dot"], "u": new["thrust"]}
         context.launch(own.velocity.pull_tangent, thrown, *known)
         context.launch(own.velocity.velocity.tangent, thrown, *known, kick_dot=dots["thrust_dot"])
-        carried = self._unmoved
-        if self._bodies is not None:
-            carried = self._bodies.carried(context, new["change"], dots["change_dot"])
+        own_bodies, changes = self._bodies, (new["change"], dots["change_dot"])
+        carried = self._unmoved if own_bodies is None else own_bodies.carried(context, *changes)
         parts = own.parts["parts"]
         context.launch(own.length.share.tangent, own.staying(k), new, dots, carried, *known, parts_dot=parts)
         context.launch(own.length.apply.tangent, at, new, dots, *known, sums_dot=own.sums(parts))
@@ -178,21 +175,13 @@ class CoarseTangent:
 
 class CoarseAdjoint:
     def __init__(
-        self,
-        coarse: Coarse,
-        layout: Layout,
-        bodies: BodiesAdjoint | None,
-        bar: Adjoints,
-        faces: FaceShares,
-        known: tuple[Named, ...],
+        self, coarse: Coarse, bodies: BodiesAdjoint | None, bar: Adjoints, faces: FaceShares, known: tuple[Named, ...]
     ):
-        precision = layout.precision
+        layout, precision = coarse.layout, coarse.layout.precision
         self._bar, self._faces, self._known = bar, faces, known
         real, vector = precision.real, precision.vector
         self._coarse, self._multiplier = coarse, coarse.numbers()
-        self._bodies = None
-        if coarse.bodies is not None and bodies is not None:
-            self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies)
+        self._bodies = CoarseBodiesAdjoint(coarse.bodies, bodies) if coarse.bodies and bodies else None
         self._bars = layout.arrays("_bar", h=vector, N=precision.matrix)
         self._steps = layout.arrays("_bar", r=real, change=real, carried=real, thrust=vector, sums=precision.pair)
         self._thrown = {"v_star": coarse.still, **layout.arrays("_bar", kick=vector, v=vector)}
@@ -211,7 +200,7 @@ class CoarseAdjoint:
         given = {"parts_sum_bar": self._sum(found["sums_bar"]), **own.staying(k)}
         context.launch(own.length.share.adjoint, given, new, own.carried(context, new["change"]), found, *known)
         if self._bodies is not None:
-            self._bodies.carried(context, found["carried_bar"], new["change"], found["change_bar"])
+            self._bodies.bodies.carried(context, found["carried_bar"], new["change"], found["change_bar"])
         thrown = {**self._thrown, "u": new["thrust"], "y": new["change"], "u_bar": found["thrust_bar"]}
         context.launch(own.velocity.own_adjoint, thrown, *known)
         context.launch(own.velocity.velocity.adjoint, thrown, *known, y_bar=found["change_bar"])

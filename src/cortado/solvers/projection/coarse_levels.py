@@ -13,7 +13,7 @@ has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the m
 from functools import cache
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -21,6 +21,7 @@ import warp as wp
 from cortado.device.launching import launch
 from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName
+from cortado.particles.state import Layout
 from cortado.solvers.projection.coarse_nodes import node_functions
 from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_type
 from cortado.sph.parts import StepContext
@@ -154,17 +155,10 @@ class Level(NamedTuple):
 
 
 class Levels:
-    def __init__(
-        self,
-        precision: Precision,
-        dimension: int,
-        shape: tuple[int, int, int],
-        members: int,
-        device: Any,
-        rows: int = 0,
-    ):
+    def __init__(self, layout: Layout, dimension: int, shape: tuple[int, int, int], rows: int):
         """Allocate all levels of a grid with the given ``shape``. ``rows`` is the number of rows of the matrix `B` of
         rigid bodies."""
+        precision, members, device = layout.precision, layout.members, layout.device
         self._kernels, self._device = level_kernels(precision, dimension), device
         self._solve = solve_kernel(precision, dimension, device.is_cpu)
         factors: list[tuple[int, ...]] = [(1, 1, 1)]
@@ -191,8 +185,7 @@ class Levels:
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
         """Number of iterations of the last solve in each scene (members,)."""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]
-        blocks = -(-counts[0] // members // BLOCK)
-        teams, team = members, 1
+        blocks, teams, team = -(-counts[0] // members // BLOCK), members, 1
         if not device.is_cpu:
             teams = min(members, device.sm_count)
             team = min(blocks, device.sm_count // teams)

@@ -268,7 +268,10 @@ class CoarseBodies:
         precision, matrix = layout.precision, layout.precision.matrix
         self.bodies, self.kernels = bodies.at_rest(), coarse_body_kernels(precision, dimension)
         self._each = 3 * dimension - 3
-        self._roots = [matrix(*_root(held.body.table.inertia).ravel()) for held in bodies.held]
+        self._roots = []
+        for held in bodies.held:
+            values, axes = np.linalg.eigh(np.linalg.pinv(held.body.table.inertia))
+            self._roots.append(matrix(*((axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T).ravel()))
         self.rows = self._each * len(bodies.held)
         self._none = layout.arrays(none=precision.real)["none"]
 
@@ -281,12 +284,6 @@ class CoarseBodies:
         """Return the divergence that pressures ``y`` remove by moving rigid bodies. The next call overwrites the
         result."""
         return self.bodies.drifted(context, self._none, y)
-
-
-def _root(inertia: np.ndarray) -> np.ndarray:
-    values, axes = np.linalg.eigh(np.linalg.pinv(inertia))
-    found: np.ndarray = (axes * np.sqrt(np.maximum(values, 0.0))) @ axes.T
-    return found
 
 
 class CoarseBodiesTangent:
@@ -310,12 +307,9 @@ class CoarseBodiesTangent:
 
 class CoarseBodiesAdjoint:
     def __init__(self, own: CoarseBodies, bodies: BodiesAdjoint):
-        self._own, self._bodies = own, bodies.at_rest(own.bodies)
+        self._own, self.bodies = own, bodies.at_rest(own.bodies)
         names = ("lifted", "lifted_bar", "carried_bar")
         self._lifted = {name: wp.zeros_like(own.bodies.drift) for name in names}
-
-    def carried(self, context: StepContext, carried_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        self._bodies.carried(context, carried_bar, y, y_bar)
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
         """Add the terms of rigid bodies to the adjoints. ``multiplier`` is the solution of the adjoint system."""
@@ -323,6 +317,6 @@ class CoarseBodiesAdjoint:
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)
         lifted_bar.zero_()
-        self.carried(context, carried_bar, lifted, lifted_bar)
+        self.bodies.carried(context, carried_bar, lifted, lifted_bar)
         found = {"carried": self._own.carried(context, lifted), "lifted_bar": lifted_bar, "e": e}
         context.launch(kernels.source_adjoint, found, *known, multiplier=multiplier)

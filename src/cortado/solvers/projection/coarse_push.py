@@ -101,13 +101,12 @@ def coarse_image_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the push and the moment of a coarse pressure."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = coarse_sums(discretisation), coarse_image_sums(discretisation), symmetric(precision)
     six, pack, times = packed.kind, packed.pack, packed.times
-    whole, topic = moment_functions(precision, dimension).change, f"projection_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
+    whole = moment_functions(precision, dimension).change
+    module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
 
     @particle_kernel(module, "T")
     def pull(coarse_i: real, L_i: matrix) -> six:
@@ -163,9 +162,8 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     """Make the kernels of the divergence that a coarse pressure has to remove."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
-    sums = projection_sums(discretisation)
-    spread, spread_tangent = image_sums(discretisation).spread.forward, image_sums(discretisation).spread.tangent
-    gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
+    sums = projection_sums(discretisation).velocity_gradient
+    (spread, spread_tangent, _), (gradient, gradient_tangent, _) = image_sums(discretisation).spread, sums
     packed, clamp = symmetric(precision), clamp_functions(precision)
     wanted, wanted_tangent, typed = clamp.wanted, clamp.wanted_tangent, types_by_name(precision)
     six, pack, (one, width) = packed.kind, packed.pack, (wp.constant(real(value)) for value in (1.0, 2.0 * CALM))

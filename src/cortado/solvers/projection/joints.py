@@ -40,9 +40,8 @@ class JointArrays:
         sizes = {f"{name}{suffix}": (layout.members, kind) for name, kind in kinds.items()}
         self.rows = [zeros(sizes, layout.device) for _ in range(rows)]
         many = {"blocks": (rows * rows, matrix), "wanted": (rows, vector), "pushes": (rows, vector)}
-        self.whole = zeros(
-            {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}, layout.device
-        )
+        sizes = {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}
+        self.whole = zeros(sizes, layout.device)
         """Matrix, right-hand side and momenta of all equations."""
         blocks, wanted, pushes = self.whole.values()
         self.entries = [{f"wanted{suffix}": wanted[k], f"push{suffix}": pushes[k]} for k in range(rows)]
@@ -60,28 +59,18 @@ class JointArrays:
         row, column = (self.side(k, far) for k, far in zip(pair.block, pair.far, strict=True))
         return {take: row[take], give: column[give]}
 
-    def clear(self) -> None:
-        for group in (*self.rows, self.whole):
-            for array in group.values():
-                array.zero_()
-
 
 @dataclass(frozen=True)
 class Row:
     """A vector equation of a hinge."""
 
     joint: Joint
-    straight: bool
-    """True for the equation of the hinge's axis, False for the equation of its point."""
+    share: float
+    """1 for the equation of the hinge's point, 0 for the equation of its axis."""
 
     @property
     def place(self) -> str:
         return f"{self.joint.name}.position"
-
-    @property
-    def share(self) -> float:
-        """Return 1 for the equation of the hinge's point, 0 for the equation of its axis."""
-        return 0.0 if self.straight else 1.0
 
     @property
     def sides(self) -> list[tuple[int, bool]]:
@@ -92,13 +81,10 @@ class Row:
 class Joints:
     def __init__(self, part: FreeSolidsPart, joints: Sequence[Joint], layout: Layout):
         self.part, self.layout = part, layout
-        space = part.made_of.dimension == 3
-        self.rows = [
-            Row(joint, straight)
-            for joint in joints
-            for straight in (False, True)
-            if not straight or (space and joint.axis is not None)
-        ]
+        self.rows = []
+        for joint in joints:
+            has_axis = part.made_of.dimension == 3 and joint.axis is not None
+            self.rows += [Row(joint, share) for share in ((1.0, 0.0) if has_axis else (1.0,))]
         count, matrix = len(self.rows), layout.precision.matrix
         self.own = JointArrays(count, layout)
         kinds = {"factors": ((count * count, layout.members), matrix), "inverses": ((count, layout.members), matrix)}
@@ -133,15 +119,15 @@ class Joints:
                 known[f"{way}middle"] = vector(*begun.middle)
                 known[f"{way}begun"] = self.layout.precision.matrix(*begun.turn.ravel())
             known["place"] = step.parameters[row.place]
-            yield k, row, self.kernels.lean if row.straight else self.kernels.point, (self.own.rows[k], known, named)
+            yield k, row, self.kernels.point if row.share else self.kernels.lean, (self.own.rows[k], known, named)
 
     def weighed(self, step: StepContext) -> Iterator[tuple[Pair, tuple[Named, ...]]]:
         """Yield `pairs` with the arguments of the kernel ``weigh``."""
         for pair in self.pairs:
             row, column = (self.rows[k] for k in pair.block)
             own = {"row_share": row.share, "share": column.share, "sign": 1.0 if pair.far[0] == pair.far[1] else -1.0}
-            own |= {"guard": GUARD[self.layout.precision.name] if row is column else 0.0}
-            own |= {"along": float(row is column and row.straight)}
+            guard = GUARD[self.layout.precision.name]
+            own |= {"guard": guard, "along": 1.0 - row.share} if row is column else {"guard": 0.0, "along": 0.0}
             body = self.part.bodies[pair.body].known(step)
             yield pair, (self.own.sides(pair), own, self.own.blocks[pair.block], *body)
 
@@ -231,8 +217,6 @@ class JointsTangent:
 
 
 class JointsAdjoint:
-    """The adjoint of `Joints`."""
-
     def __init__(self, joints: Joints, bar: Adjoints, turned: Sequence[Arrays]):
         self._joints, self._bar, self._turned = joints, bar, turned
         self._bars = JointArrays(len(joints.rows), joints.layout, "_bar")
@@ -240,7 +224,9 @@ class JointsAdjoint:
         self._poses = zeros(dict.fromkeys(names, (members, joints.layout.precision.vector)), joints.layout.device)
 
     def begin(self) -> None:
-        self._bars.clear()
+        for group in (*self._bars.rows, self._bars.whole):
+            for array in group.values():
+                array.zero_()
 
     def join(self, step: StepContext, moved: Sequence[Arrays], moved_bar: Sequence[Arrays]) -> None:
         """Apply the adjoint of `Joints.join` to the adjoints of velocities, ``moved_bar``."""
@@ -262,9 +248,8 @@ class JointsAdjoint:
         of, bars, bar, members = self._joints, self._bars, self._bar, self._joints.layout.members
         for pair, known in of.weighed(step):
             rates = {**self._turned[pair.body], "density_bar": bar.parameters[of.weight(pair.body)]}
-            step.launch(
-                of.kernels.weigh.adjoint, bars.sides(pair), bars.blocks[pair.block], rates, *known, threads=members
-            )
+            changes = bars.sides(pair), bars.blocks[pair.block], rates
+            step.launch(of.kernels.weigh.adjoint, *changes, *known, threads=members)
         for k, row, kernels, known in of.frames(step):
             rates = {"place_bar": bar.parameters[row.place], "time_step_bar": bar.parameters["time_step"]}
             for array in self._poses.values():

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cortado.device.grid import Grid
-from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets, rest_volume
+from cortado.discretise.smoothing import lattice_offsets, rest_volume
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene
 
@@ -27,19 +27,6 @@ class ProjectionConstants:
     nearest_weight: float
     """Smoothing kernel at a distance of one spacing, times the volume of a particle [-]."""
 
-    @classmethod
-    def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "ProjectionConstants":
-        """Compute the constants for a lattice with this spacing [m] and support radius [m]. The relaxation factor makes
-        the Jacobi iteration stable for the stiffest pressure wave."""
-        offsets = lattice_offsets(spacing, support, dimension)
-        volume = rest_volume(kernel, spacing, support, dimension)
-        gradients = volume * kernel.gradient(offsets, support)
-        square = float((gradients**2).sum())
-        waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
-        stiffest = float(((np.sin(waves @ offsets.T) @ gradients) ** 2).sum(axis=1).max()) / square
-        nearest = volume * float(kernel.weight(np.array([spacing]), dimension, support)[0])
-        return cls(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
-
     def repair_relaxations(self, repairs: int) -> list[float]:
         """Return the relaxation factor of each repair, from the roots of a Chebyshev polynomial (Golub and
         Varga 1961)."""
@@ -49,8 +36,18 @@ class ProjectionConstants:
 
 
 def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
-    lattice = discrete.kernel, scene.discretisation.spacing, discrete.lattice.support, scene.dimension
-    return ProjectionConstants.of(*lattice)
+    """Compute the constants on the rest lattice of a scene. The relaxation factor makes the Jacobi iteration stable for
+    the stiffest pressure wave."""
+    kernel, spacing, dimension = discrete.kernel, scene.discretisation.spacing, scene.dimension
+    support = discrete.lattice.support
+    offsets = lattice_offsets(spacing, support, dimension)
+    volume = rest_volume(kernel, spacing, support, dimension)
+    gradients = volume * kernel.gradient(offsets, support)
+    square = float((gradients**2).sum())
+    waves = np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, 25), repeat=dimension)))
+    stiffest = float(((np.sin(waves @ offsets.T) @ gradients) ** 2).sum(axis=1).max()) / square
+    nearest = volume * float(kernel.weight(np.array([spacing]), dimension, support)[0])
+    return ProjectionConstants(spacing, 1.0 / (MARGIN * stiffest), DEPARTURE * square, nearest)
 
 
 SPACING = 2.0

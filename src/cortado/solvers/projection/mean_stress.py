@@ -57,10 +57,8 @@ class MeanStress:
     def __init__(self, system: ParticleSystem):
         discretisation, layout = system.discretisation, system.layout
         self._faces, self._kernels = FaceShares(system), mean_stress_kernels(discretisation, system.walled.dimension)
-        works = {"reach": _reach_work, "mirrors": _mirror_work}
-        self._walls = {
-            name: WallSums(WallTerm(discretisation, TOPIC, work, "reach_bar"), layout) for name, work in works.items()
-        }
+        works, own = {"reach": _reach_work, "mirrors": _mirror_work}, (discretisation, TOPIC)
+        self._walls = {name: WallSums(WallTerm(*own, work, "reach_bar"), layout) for name, work in works.items()}
         self._arrays = layout.arrays(q=layout.precision.real, reach_bar=layout.precision.vector)
 
     def _totals(self, context: StepContext, known: tuple[Named, ...]) -> Named:
@@ -103,13 +101,11 @@ def spread_term(d: Discretisation) -> Any:
 
 @cache
 def mean_stress_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the mean normal stress."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, (six, pack) = neighbourhood_type(precision), (symmetric(precision).kind, symmetric(precision).pack)
     whole, per = moment_functions(precision, dimension).change, wp.constant(real(1.0 / dimension))
-    topic = f"{TOPIC}_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
+    module, tangent_module, adjoint_module = discretisation.modules(f"{TOPIC}_{dimension}d")
     spread = fluid_sum(discretisation, module=module)(spread_term(discretisation))
     spread_tangent = made_tangent(discretisation, spread_term, tangent_module)
     spread_adjoint = made_adjoint(discretisation, spread_term, adjoint_module)
@@ -205,8 +201,7 @@ def image_load_kernels(discretisation: Discretisation) -> Kernels:
     """Make the kernels of forces of images on the walls of a solid."""
     real, vector, _ = discretisation.types
     module, tangent_module, adjoint_module = discretisation.modules("image_loads")
-    lift = image_sums(discretisation).lift
-    load, load_tangent, load_back = map(image_sum_of_solid, (lift.forward, lift.tangent, lift.adjoint))
+    load, load_tangent, load_back = map(image_sum_of_solid, image_sums(discretisation).lift)
 
     @particle_kernel(module, "total", [over(load, "found")], numbers=["solid"])
     def image_load(found: vector) -> vector:
@@ -240,13 +235,14 @@ class ImageLoads:
 
     def __init__(self, density: Surroundings):
         self._density, self._layout = density, density.system.layout
+        self._image = {"image": density.around["image"]}
         self._kernels = image_load_kernels(density.discretisation)
         self._walls = WallSums(WallTerm(density.discretisation, "image_loads", _mirrored_work, "f"), self._layout)
         self._faces = FaceShares(density.system)
 
     def total(self, step: StepContext, solid: int, p: wp.array) -> wp.array:
         """Return the forces by pressures ``p`` (n,) [Pa] on the walls of a solid, or on all walls."""
-        found, known = self._vectors["total"], {"y": p, "image": self._density.around["image"]}
+        found, known = self._vectors["total"], {"y": p, **self._image}
         step.launch(self._kernels.forward, known, solid=solid, total=found)
         add(self._walls.total(step, solid, known), found)
         return found
@@ -254,8 +250,7 @@ class ImageLoads:
     def tangent(self, step: StepContext, dot: Tangents, solid: int, p: wp.array, p_dot: wp.array) -> wp.array:
         found, around = self._vectors["total_dot"], self._tangent
         around.measure(step, dot)
-        known = {"y": p, "image": self._density.around["image"]}
-        known |= {"y_dot": p_dot, "image_dot": around.around["image_dot"]}
+        known = {"y": p, "y_dot": p_dot, **self._image, "image_dot": around.around["image_dot"]}
         step.launch(self._kernels.tangent, known, *dot.named, solid=solid, total_dot=found)
         add(self._walls.tangent(step, dot, solid, known), found)
         return found
@@ -265,8 +260,7 @@ class ImageLoads:
     ) -> None:
         around = self._adjoint
         around.begin()
-        known = {"y": p, "image": self._density.around["image"]}
-        known |= {"y_bar": p_bar, "image_bar": around.around["image_bar"]}
+        known = {"y": p, "y_bar": p_bar, **self._image, "image_bar": around.around["image_bar"]}
         step.launch(self._kernels.adjoint, known, *bar.named, solid=solid, f=total_bar)
         self._walls.adjoint(step, bar, solid, total_bar, total_bar, known)
         self._faces.add(step, bar, known, over=solid, u=total_bar, spread=p)

@@ -29,7 +29,6 @@ precedes the first iteration.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -88,27 +87,18 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     """Make the kernels of a pressure iteration, with tangent and adjoint."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, sums = precision.pair, projection_sums(discretisation)
-    packed, matrix = symmetric(precision), precision.matrix
-    six, pack = packed.kind, packed.pack
-    mirrors = image_sums(discretisation)
-    spread, spread_tangent = mirrors.spread.forward, mirrors.spread.tangent
-    lift, lift_back = mirrors.lift.forward, mirrors.lift.adjoint
-    gradient, gradient_tangent = sums.velocity_gradient.forward, sums.velocity_gradient.tangent
-    topic = f"projection_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
-    weights4 = weights_type(precision)
-    own = {
-        name: kind
-        for name, kind in entries(precision).items()
-        if name in ("L", "gamma", "drift", "a", "weights", "image")
-    }
-    seen = bundle(**own)
-    bars = bundle(x=vector, n=real, time_step=real, **own)
+    packed, matrix, weights4 = symmetric(precision), precision.matrix, weights_type(precision)
+    six, pack, mirrors = packed.kind, packed.pack, image_sums(discretisation)
+    (spread, spread_tangent, _), (lift, _, lift_back) = mirrors.spread, mirrors.lift
+    gradient, gradient_tangent, _ = sums.velocity_gradient
+    module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
+    kinds = entries(precision)
+    own = {name: kind for name, kind in kinds.items() if name in ("L", "gamma", "drift", "a", "weights", "image")}
+    seen, bars = bundle(**own), bundle(x=vector, n=real, time_step=real, **own)
     iterate, shared = bundle(u=vector, A=matrix, d=real, y=real, k=real), bundle(coarse=real, **own)
     moving, moved = bundle(u=vector, y=real, k=real, **own), bundle(A_dot=matrix, k_out_dot=real, y_out_dot=real)
-    clamp, LANES = clamp_functions(precision), discretisation.lanes
+    clamp, LANES, lane = clamp_functions(precision), discretisation.lanes, discretisation.lane
     wanted, wanted_tangent, parts = clamp.wanted, clamp.wanted_tangent, clamp.parts
-    lane = discretisation.lane
 
     names = {seen: "of", bars: "bar", six: "S T", neighbourhood: "s", vector: "x g u", matrix: "A", iterate: "at"}
     typed = TypesByName(real, names)
@@ -284,4 +274,4 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     roles: dict[str, Any] = {"numbers": ["spacing"], "known": ["time_step", "beside", "surfaced"]}
     results, replaced = ["weights", "k", "y", "u"], {"weights": "weights"}
     roles |= {"written": ["k_before", "kick_before"], "replaced": replaced}
-    return replace(pointwise_kernels(precision, modules, lambda _: start, results, **roles), forward=begin)
+    return pointwise_kernels(precision, modules, lambda _: start, results, **roles)._replace(forward=begin)

@@ -38,19 +38,13 @@ FARTHEST = 1.0 / 6.0
 
 @cache
 def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of a repair."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, weights4 = precision.pair, weights_type(precision)
-    sums, densities = projection_sums(discretisation), density_sums(discretisation)
-    push, push_tangent, push_back = sums.push.forward, sums.push.tangent, sums.push.adjoint
-    mirrors = image_sums(discretisation)
-    image_weights, image_weights_tangent = mirrors.weights.forward, mirrors.weights.tangent
-    lift, lift_tangent, lift_back = mirrors.lift.forward, mirrors.lift.tangent, mirrors.lift.adjoint
-    behind, behind_tangent, behind_back = mirrors.behind.forward, mirrors.behind.tangent, mirrors.behind.adjoint
-    mirror_of = mirrors.mirror_of
-    weights, weights_tangent, weights_adjoint = densities.forward, densities.tangent, densities.adjoint
-    topic = f"projection_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
+    mirrors, (push, push_tangent, push_back) = image_sums(discretisation), projection_sums(discretisation).push
+    (image_weights, image_weights_tangent, _), mirror_of = mirrors.weights, mirrors.mirror_of
+    (lift, lift_tangent, lift_back), (behind, behind_tangent, behind_back) = mirrors.lift, mirrors.behind
+    weights, weights_tangent, weights_adjoint = density_sums(discretisation)
+    module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
     own = {name: kind for name, kind in entries(precision).items() if name in ("gamma", "a", "weights", "image")}
     seen, bars = bundle(**own), bundle(x=vector, m=real, **own)
     LANES, lane = discretisation.lanes, discretisation.lane

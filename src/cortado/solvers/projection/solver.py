@@ -54,7 +54,7 @@ class ProjectionTangent(ParticleTangent):
         if solver.bodies is not None:
             (part,) = (part for part in self._parts if isinstance(part, FreeSolidsTangent))
             self._bodies = BodiesTangent(solver.bodies, part.bodies, self.dot, self._around)
-        self._coarse = CoarseTangent(solver.coarse, layout, self._bodies, self._known)
+        self._coarse = CoarseTangent(solver.coarse, self._bodies, self._known)
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
         solver, kernels, own, known = self._solver, self._solver.kernels, self._own, self._known
@@ -147,29 +147,26 @@ class ProjectionAdjoint(ParticleAdjoint):
             (part,) = (part for part in self._parts if isinstance(part, FreeSolidsAdjoint))
             self._bodies = BodiesAdjoint(solver.bodies, part.bodies, self.bar, self._around)
             self._drift_bar = {"drift_bar": self._bodies.drift_bar}
-        self._coarse = CoarseAdjoint(solver.coarse, layout, self._bodies, self.bar, self._faces, self._known)
-
-    def step(self, counts: Counts, state_bar: State, parameters: Parameters) -> None:
-        self._begin(state_bar, parameters)
-        self._go_back(counts, state_bar, parameters)
+        self._coarse = CoarseAdjoint(solver.coarse, self._bodies, self.bar, self._faces, self._known)
 
     def from_within(self, counts: Counts, within: WithinBar, state_bar: State, parameters: Parameters) -> None:
-        solver, own = self._solver, self._own
         state_bar.clear()
-        self._begin(state_bar, parameters)
-        context, last = solver.context(parameters), solver.iterates[counts[0]]
+        self.step(counts, state_bar, parameters, within)
+
+    def _press(self, context: StepContext, k: wp.array, within: WithinBar) -> None:
+        """Add the adjoints of pressures ``within`` the step to the adjoints of the last pressures ``k``."""
+        solver, own = self._solver, self._own
         pressed = pressed_kernels(solver.layout.precision).adjoint
-        context.launch(pressed, *self._known, impulse=last["k"], p_bar=within.p, impulse_bar=own["k_bar"])
+        context.launch(pressed, *self._known, impulse=k, p_bar=within.p, impulse_bar=own["k_bar"])
         if within.stress is not None:
             own["q_bar"].zero_()
-            q = solver.mean_stress.impulses(context, last, solver.known)
+            q = solver.mean_stress.impulses(context, {"k": k}, solver.known)
             context.launch(pressed, *self._known, impulse=q, p_bar=within.stress, impulse_bar=own["q_bar"])
-            at = {"k": last["k"], "T": solver.known["T"], "q_bar": own["q_bar"]}
+            at = {"k": k, "T": solver.known["T"], "q_bar": own["q_bar"]}
             solver.mean_stress.adjoint(context, self.bar, at, *self._known)
-        self._go_back(counts, state_bar, parameters, within)
 
-    def _begin(self, state_bar: State, parameters: Parameters) -> None:
-        solver, own, context = self._solver, self._own, self._solver.context(parameters)
+    def _begin(self, context: StepContext, state_bar: State) -> None:
+        solver, own = self._solver, self._own
         free_bar = self.unsort(context, state_bar)
         scene = {"x_scene": free_bar.positions, "v_scene": free_bar.velocities}
         scene |= {"m_scene": state_bar["reference_density"], "m": self._m_unused}
@@ -183,11 +180,12 @@ class ProjectionAdjoint(ParticleAdjoint):
         if self._bodies is not None:
             self._bodies.begin()
 
-    def _go_back(
-        self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None
-    ) -> None:
+    def step(self, counts: Counts, state_bar: State, parameters: Parameters, within: WithinBar | None = None) -> None:
         solver, kernels, own, known = self._solver, self._solver.kernels, self._own, self._known
         context, (iterations, repairs) = solver.context(parameters), counts
+        self._begin(context, state_bar)
+        if within is not None:
+            self._press(context, solver.iterates[iterations]["k"], within)
         end, last = solver.end_of(iterations), solver.repaired[repairs]
         if solver.sides is not None:
             solver.sides.adjoint(context, self.bar, last["x_now"], own["x_now_bar"])
@@ -260,8 +258,6 @@ class ProjectionAdjoint(ParticleAdjoint):
 
 
 class Projection(ProjectionSteps):
-    """The projection solver with derivatives."""
-
     def tangent(self, parameters_dot: Parameters) -> StepTangent:
         return ProjectionTangent(self, parameters_dot)
 
@@ -269,7 +265,7 @@ class Projection(ProjectionSteps):
         return ProjectionAdjoint(self, steps)
 
 
-class ProjectionMaker:
+class Maker:
     batches = True
 
     def __init__(self, table: ProjectionSolver):
@@ -277,16 +273,11 @@ class ProjectionMaker:
 
     def build(self, setting: SolverSetting) -> Solver:
         """Make the projection solver. Without pressure, make PCISPH, which then takes equal steps."""
-        system, table = particle_system(setting), self._table
+        system, table, batch = particle_system(setting), self._table, setting.batch
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
-        if setting.batch is not None and table.tolerance is not None:
-            raise InputError(
-                f"batch is {setting.batch}, but must be left out, as solver.tolerance is that of one scene."
-            )
+        if batch is not None and table.tolerance is not None:
+            raise InputError(f"batch is {batch}, but must be left out, as solver.tolerance is that of one scene.")
         grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
         constants = lattice_constants(setting.scene, setting.discrete)
         return Projection(system, table, constants, grid, endless(setting.discrete))
-
-
-maker = ProjectionMaker

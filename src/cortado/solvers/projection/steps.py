@@ -42,7 +42,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Parameters, State, StateField
 from cortado.scene.solvers import ProjectionSolver
-from cortado.solvers.loop import ROOT_MEAN_SQUARE, IterationLog, Loop, LoopLimits
+from cortado.solvers.loop import IterationLog, Loop, LoopLimits
 from cortado.solvers.particles import ParticleSolver, ParticleSystem
 from cortado.solvers.projection.bodies import Bodies
 from cortado.solvers.projection.coarse import Coarse
@@ -79,7 +79,6 @@ WEAK = 0.004
 
 @cache
 def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the shift."""
     precision, modules = d.precision, d.modules(f"projection_{dimension}d")
     real, vector, typed = precision.real, precision.vector, types_by_name(precision)
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -166,16 +165,18 @@ class ProjectionSteps(ParticleSolver):
         )
         precision = self.layout.precision
         real, vector = precision.real, precision.vector
-        kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
-        self._iterate_kinds, self._repair_kinds = kinds, {"x_now": vector, "c": real, "excess": real, "held": real}
-        self.iterates = [self.layout.arrays(**self._iterate_kinds)]
+        self._iterate_kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
+        self._repair_kinds = {"x_now": vector, "c": real, "excess": real, "held": real}
+        self.iterates: list[dict[str, wp.array]] = []
         """Velocities, velocity gradients, divergences and pressures before each iteration. The last entry is the
         result."""
-        self.repaired = [self.layout.arrays(**self._repair_kinds)]
+        self.corrected: list[dict[str, wp.array]] = []
+        """Velocities and pressures after each coarse correction."""
+        self.repaired: list[dict[str, wp.array]] = []
         """Positions, multipliers and density errors before each repair."""
         vectors = dict.fromkeys(("x_star", "v_star", "kick", "x_moved", "delta"), vector)
         self.known: dict[str, Any] = {
-            **self.around,
+            **self.density.around,
             **self.density.constants,
             **{"spacing": constants.spacing, "omega": constants.relaxation},
             **self.layout.arrays(**vectors, T=symmetric(precision).kind),
@@ -187,14 +188,13 @@ class ProjectionSteps(ParticleSolver):
         """Keeps particles on their sides of sheets; None without sheets."""
         self.following = following_kernels(*own) if table.velocities_follow else None
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
-        self.bodies = Bodies(free[0], self.discretisation, self.around) if free else None
+        self.bodies = Bodies(free[0], self.discretisation, self.density.around) if free else None
         self.coarse = Coarse(system, grid, self.bodies, endless)
         self.known["warm"] = self.coarse.warm
-        self.corrected = [self._new_corrected()]
-        """Velocities and pressures after each coarse correction."""
+        ProjectionSteps.reserve(self, (0, 0))
         self.repair_relaxations = constants.repair_relaxations(repairs)
         self.loops = (
-            Loop(limits, self.layout, self.launch, "iterations", "divergence", ROOT_MEAN_SQUARE),
+            Loop(limits, self.layout, self.launch, "iterations", "divergence", weighted=True),
             Loop(LoopLimits(repairs, repairs, 0.0, 0.0), self.layout, self.launch, "repairs", "density_errors"),
         )
 
@@ -203,10 +203,6 @@ class ProjectionSteps(ParticleSolver):
 
     def kick_of(self, carried: Carried) -> wp.array:
         return carried[KICK]
-
-    @property
-    def around(self) -> dict[str, wp.array]:
-        return self.density.around
 
     def wall_push(self) -> ProjectionPush:
         return ProjectionPush(self.system, self.constants)
@@ -228,12 +224,9 @@ class ProjectionSteps(ParticleSolver):
         iterations, repairs = counts
         while len(self.iterates) <= iterations:
             self.iterates.append(self.layout.arrays(**self._iterate_kinds))
-            self.corrected.append(self._new_corrected())
+            self.corrected.append({**self.layout.arrays(**self._iterate_kinds), **self.coarse.room()})
         while len(self.repaired) <= repairs:
             self.repaired.append(self.layout.arrays(**self._repair_kinds))
-
-    def _new_corrected(self) -> dict[str, wp.array]:
-        return {**self.layout.arrays(**self._iterate_kinds), **self.coarse.room()}
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         self.reserve(counts)
@@ -304,7 +297,7 @@ class ProjectionSteps(ParticleSolver):
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
         """Return the divergence by moving walls, with free bodies under the pressures of an iteration."""
-        drift = self.around["drift"]
+        drift = self.density.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
     def settle(self, context: StepContext, last: int) -> None:

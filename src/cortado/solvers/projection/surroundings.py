@@ -40,20 +40,15 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     """Make the kernels that compute the surroundings of all particles, with derivatives."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
-    neighbourhood, sums = neighbourhood_type(precision), projection_sums(discretisation)
-    moments, moments_tangent, moments_back = sums.moments.forward, sums.moments.tangent, sums.moments.adjoint
-    walls = beside_sums(discretisation)
-    beside, beside_tangent, beside_back = walls.forward, walls.tangent, walls.adjoint
-    mirrors = image_sums(discretisation)
-    image_weights, image_weights_tangent, echo = mirrors.weights.forward, mirrors.weights.tangent, mirrors.echo
-    by_mirrors, mirror_of = mirrors.walls, mirrors.mirror_of
-    mirror_walls, mirror_walls_tangent, mirror_walls_back = by_mirrors.forward, by_mirrors.tangent, by_mirrors.adjoint
-    sweep, sweep_tangent = mirrors.sweep.forward, mirrors.sweep.tangent
-    topic = f"projection_{dimension}d"
-    module, tangent_module, adjoint_module = discretisation.modules(topic)
+    neighbourhood, mirrors = neighbourhood_type(precision), image_sums(discretisation)
+    moments, moments_tangent, moments_back = projection_sums(discretisation).moments
+    beside, beside_tangent, beside_back = beside_sums(discretisation)
+    (image_weights, image_weights_tangent, _), (sweep, sweep_tangent, _) = mirrors.weights, mirrors.sweep
+    (mirror_walls, mirror_walls_tangent, mirror_walls_back), mirror_of = mirrors.walls, mirrors.mirror_of
+    module, tangent_module, adjoint_module = discretisation.modules(f"projection_{dimension}d")
     own, packed = moment_functions(precision, dimension), symmetric(precision)
     whole, change, six, pack = own.whole, own.change, packed.kind, packed.pack
-    here = effect_functions(precision, dimension, module)
+    echo, here = mirrors.echo, effect_functions(precision, dimension, module)
     weights_of, correction_of, diagonal_of, share_of = here.weights, here.correction, here.diagonal, here.share
     along = effect_functions(precision, dimension, tangent_module).back
     back = effect_functions(precision, dimension, adjoint_module).back

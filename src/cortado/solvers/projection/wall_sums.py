@@ -323,9 +323,7 @@ class FaceShares:
         kinds = {"u": precision.vector, "slope": precision.matrix, **dict.fromkeys(NUMBERS, precision.real)}
         self._nothing = system.layout.arrays(**kinds) if self._faces else {}
 
-    def add(
-        self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: wp.array
-    ) -> None:
+    def add(self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: Any) -> None:
         """Add the terms of images in all walls, or in the walls of the solid ``over``. Missing ``arrays``
         count as 0."""
         if self._faces:
