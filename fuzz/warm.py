@@ -2,7 +2,7 @@
 
 import importlib
 
-from cortado.device.modules import silenced
+from cortado.device.modules import init_warp
 
 MODULES = (
     "av",
@@ -20,9 +20,6 @@ MODULES = (
 
 def warm() -> None:
     """Import Cortado and start Warp, but launch no kernel, so that this process can be forked."""
-    import warp as wp
-
-    with silenced():
-        wp.init()
+    init_warp()
     for module in MODULES:
         importlib.import_module(module)

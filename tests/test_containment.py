@@ -136,14 +136,14 @@ def test_the_device_finds_the_particles_that_numpy_finds(name, precision):
     order = random.permutation(n)
     state = layout.state((POSITIONS, VELOCITIES))
     state.set({"positions": after})
-    containment.look(
-        wp.array(np.tile(order, 2), dtype=wp.int32, device=device),
-        to_device(before[order], real, device),
-        wp.array(np.ones(n), dtype=real.real, device=device),
-        to_device(after[order], real, device),
-        to_device(np.zeros((n, d)), real, device),
-        state,
-    )
+    known = {
+        "order": wp.array(np.tile(order, 2), dtype=wp.int32, device=device),
+        "x_before": to_device(before[order], real, device),
+        "rho_0": wp.array(np.ones(n), dtype=real.real, device=device),
+        "x_free": to_device(after[order], real, device),
+        "v_free": to_device(np.zeros((n, d)), real, device),
+    }
+    containment.look(known, state)
     assert int(containment.bad_particle.numpy()[0]) == np.flatnonzero(wanted)[0]
     assert int(containment._count.numpy()[0]) == wanted.sum()
 

@@ -212,7 +212,7 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
     assert first is not None
     size, limits = float(first[0]), chosen_limits(scene)
     scheduled = scheduled_bounds(scene, {}, SceneParameters(simulation, 1))
-    limits |= {name: bound.longest(0.0) for name, bound in scheduled.items()}
+    limits |= {name: bound(0.0) for name, bound in scheduled.items()}
     if size < min(limits.values()) * (1.0 - SAME):
         limits["speed"] = size
     return size, limits, min(limits, key=lambda name: limits[name])

@@ -192,7 +192,7 @@ ROOM = 16 * 2**20
 def start_warp() -> None:
     """Start Warp once per process. If Warp's cache is unusable, print a warning and compile kernels in a temporary
     folder. Raises `ComputationError` if no temporary folder can be made."""
-    reason, folder, temporary = _start(), wp.config.kernel_cache_dir, None
+    reason, folder, temporary = init_warp(), wp.config.kernel_cache_dir, None
     reason = reason or _trouble(folder)
     if reason is None:
         return
@@ -207,7 +207,7 @@ def start_warp() -> None:
             f"Compiled kernels can be kept neither in {folder} ({reason}) nor in a temporary folder; "
             f"set the environment variable {CACHE_PATH} to a folder that can be written."
         )
-    _start()
+    init_warp()
     say(
         f"Warning: Compiled kernels cannot be kept in {folder} ({reason}), so new ones are compiled in every "
         f"run; mend that, or set the environment variable {CACHE_PATH} to a folder that can be written."
@@ -228,7 +228,7 @@ def complaint(error: Exception) -> str | None:
     )
 
 
-def _start() -> str | None:
+def init_warp() -> str | None:
     """Start Warp, and return the reason why it cannot store kernels, or None. Warp's messages are suppressed, and later
     only warnings and errors are shown, unless the user chose a log level."""
     chosen = wp.config.log_level

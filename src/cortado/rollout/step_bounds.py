@@ -6,6 +6,7 @@ emitters and solids.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from math import ceil, inf, log
 from typing import Any
@@ -123,33 +124,24 @@ class Travel:
         return min(way / self.furthest, duration / self.least) + grown / log(GROWTH)
 
 
-@dataclass(frozen=True, eq=False)
-class Pull:
-    """The bound on time steps by scheduled gravity or tilt."""
-
-    scene: Scene
-    course: Knots
-    upright: Callable[[NDArray], NDArray]
-    """Function that converts values of gravity or tilt to vectors of gravity (k, d) [m/s2]."""
-    greatest: float
-
-    def longest(self, time: float) -> float:
-        """Return the longest time step [s] that stays within the bound of gravity from ``time`` [s] on."""
-        ways = np.linspace(0.0, self.greatest, 9)
-        known = self.course.breaks - time
-        ways = np.concatenate([ways, known[(known > 0.0) & (known < self.greatest)]])
-        limits = np.minimum.reduce([*gravity_limits(self.scene, self.upright(self.course.at(time + ways))).values()])
-        return float(np.maximum(limits, ways).min())
-
-
-def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Travel | Pull]:
-    """Return the bounds on time steps from paths and from scheduled gravity. The keys are phrases for messages."""
+def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Callable[[float], float]]:
+    """Return the bounds on time steps from paths and from scheduled gravity or tilt. The keys are phrases for messages.
+    The values are functions of a time [s]. They return the longest time step [s] from then on."""
     courses, greatest = parameters.courses(values), greatest_step(scene, values)
     upright: dict[str, Any] = {"gravity": np.asarray, "tilt": Tilt(scene.forces.gravity).gravity}
-    pulls = {name: one for name, one in courses.items() if name in upright and isinstance(one, Knots)}
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
-    own = {f"the scheduled {name}": Pull(scene, one, upright[name], greatest) for name, one in pulls.items()}
-    return {"the speed along paths": travel, **own}
+    found: dict[str, Callable[[float], float]] = {"the speed along paths": travel.longest}
+
+    def pulled(name: str, course: Knots, time: float) -> float:
+        ways, known = np.linspace(0.0, greatest, 9), course.breaks - time
+        ways = np.concatenate([ways, known[(known > 0.0) & (known < greatest)]])
+        limits = gravity_limits(scene, upright[name](course.at(time + ways)))  # of vectors (k, d) [m/s2]
+        return float(np.maximum(np.minimum.reduce([*limits.values()]), ways).min())
+
+    for name, course in courses.items():
+        if name in upright and isinstance(course, Knots):
+            found[f"the scheduled {name}"] = partial(pulled, name, course)
+    return found
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
@@ -166,7 +158,7 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
 
     def longest(times: NDArray) -> NDArray:
         each = zip(of_courses, times.tolist(), strict=True)
-        return np.array([min(bound.longest(time) for bound in own.values()) for own, time in each])
+        return np.array([min(bound(time) for bound in own.values()) for own, time in each])
 
     def fill(step: int, times: NDArray, sizes: NDArray) -> None:
         each = zip(members, times.tolist(), sizes.tolist(), strict=True)

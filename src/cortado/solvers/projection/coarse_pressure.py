@@ -195,7 +195,6 @@ def length_kernels(precision: Precision) -> SimpleNamespace:
 
 @cache
 def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the kernels of free bodies on the coarse grid."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, hats, among = cell_grid_type(precision), hat_functions(precision, dimension), node_functions(dimension)
     hat, at, beside, corner_step = hats.hat, hats.at, among.beside, among.corner_step

@@ -84,7 +84,6 @@ def clamp_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of a pressure iteration, with tangent and adjoint."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, sums = precision.pair, projection_sums(discretisation)
     packed, matrix, weights4 = symmetric(precision), precision.matrix, weights_type(precision)

@@ -198,7 +198,6 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of velocities under pressures, with derivatives."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     sums, mirrors, packed = projection_sums(discretisation), image_sums(discretisation), symmetric(precision)

@@ -37,7 +37,6 @@ def bar_entries(precision: Precision) -> dict[str, Any]:
 
 @cache
 def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels that compute the surroundings of all particles, with derivatives."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     neighbourhood, mirrors = neighbourhood_type(precision), image_sums(discretisation)
