@@ -3,7 +3,7 @@
 Rollouts, gradients, files and reports of runs use a solver only through this protocol.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
