@@ -65,7 +65,7 @@ def test_nearer_particles_hide_farther_ones(tmp_path):
 def test_particles_side_by_side_share_their_scale(tmp_path, dimension):
     points = block(dimension)
     corners = (np.full(dimension, -0.1), np.full(dimension, 0.8))
-    options = {"container": corners, "dimension": dimension}
+    options = {"container": corners}
     path = plots.particles([points, points + 0.1], ["before", "after"], tmp_path / "a.png", **options)
     ink = pixels(path).sum(axis=-1) < 450
     left, right = ink[:, : ink.shape[1] // 2], ink[:, ink.shape[1] // 2 :]

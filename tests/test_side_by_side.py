@@ -43,7 +43,8 @@ def test_the_nearest_frame_is_shown():
     shown = ShownFrames(own, times)
     distances = np.abs(own[:, None] - times)
     np.testing.assert_allclose(distances[shown.nearest, np.arange(41)], distances.min(axis=0), atol=1e-12)
-    assert shown.off == pytest.approx(0.07) and shown.during.sum() == 31
+    off = np.abs(shown.own[shown.nearest] - shown.times)[shown.during].max()
+    assert off == pytest.approx(0.07) and shown.during.sum() == 31
     assert shown.time_in_words(8) == "0.10 s" and shown.time_in_words(40) == "stands still at 0.30 s"
     assert ShownFrames(own + 0.2, times).notes("late")[0].startswith('"late" begins at 0.2 s')
 

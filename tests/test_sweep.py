@@ -183,8 +183,8 @@ def test_another_task_is_not_gone_on_with(sweep, folder):
 
 
 def test_a_worker_that_does_not_see_the_folder_says_so(folder):
-    options = (None, folder / "elsewhere", "cpu", "float32", ALL_FRAMES, True)
-    member = cortado.cli.sweep.Member(folder / "task.toml", *options)
+    asked = cortado.cli.sweep.RunRequest(folder / "elsewhere")
+    member = cortado.cli.sweep.Member(folder / "task.toml", None, asked, ALL_FRAMES)
     with pytest.raises(InputError, match=r"^A worker does not see \S+elsewhere, but the task and the folder"):
         member(combinations(["problem.steps=4"])[0])
 

@@ -35,14 +35,12 @@ Device = Annotated[str, arg(help='"cpu", or "cuda:0" for the first GPU.')]
 Precision = Annotated[str, arg(help='"float32" or "float64".')]
 Json = Annotated[bool, arg(help="Print JSON for machines.", help_behavior_hint="")]
 Quiet = Annotated[bool, arg(help="Say nothing but results, warnings and errors.", help_behavior_hint="")]
-
 STEPS = 200
 """Number of steps of a run if the user gives neither a number of steps nor a time."""
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Return a decorator that adds a function to a group of commands. The option --quiet hides the printed text, unless
-    ``answers`` is true."""
+    """Return a decorator that adds a function to a group of commands. --quiet hides texts that are no ``answers``."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -114,8 +112,7 @@ ALL_FRAMES = FrameOptions()
 
 @dataclass(frozen=True)
 class Where:
-    """The options --scheduler and --workers of a command. Raises `InputError` if both options are given, or for too
-    many workers."""
+    """The options --scheduler and --workers of a command. Raises `InputError` for both of them or too many workers."""
 
     scheduler: str | None = None
     """Address of a Dask scheduler."""
@@ -135,8 +132,7 @@ class Where:
 
     @contextmanager
     def executor(self, device: str, items: int) -> "Iterator[Executor]":
-        """Yield the executor for ``items`` computations: a Dask scheduler, local worker processes, or this process.
-        Each worker on GPUs gets its own GPU."""
+        """Yield the executor for ``items`` computations: Dask's, local workers with a GPU each, or this process."""
         from cortado.executors import Distributed, InProcess, local_workers
 
         if self.scheduler is not None:
@@ -170,8 +166,7 @@ def require_one_of_both(resume: bool, overwrite: bool) -> None:
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, by default `STEPS`, or None if a time [s] is given. Raises `InputError` if both are
-    given."""
+    """Return the number of steps, by default `STEPS`, or None with a time [s]. Raises `InputError` for both."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:

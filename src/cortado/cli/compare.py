@@ -1,5 +1,4 @@
-"""The commands ``cortado compare`` and ``cortado convergence``. ``compare`` compares two runs, or a run with measured
-data. ``convergence`` compares several runs."""
+"""The commands ``cortado compare``, of two runs or of a run and measured data, and ``cortado convergence``."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -28,16 +27,18 @@ FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
 SPACING, TIME_STEP = "discretisation.spacing", "solver.time_step"
 SIZE_UNITS = {SPACING: "m", TIME_STEP: "s"}
 LEAST_RUNS = 3
-SAME_MASS = 0.005
-"""Relative difference below which two masses of fluid count as equal."""
+LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
+"""Range of possible orders of convergence."""
+LOWEST, HIGHEST = 0.5, 2.0
+"""Range of trusted orders of convergence."""
+SAFE, UNSURE = 1.25, 3.0
+"""Safety factors of Roache (1994): with three sizes and a trusted order, and without."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
     one, other = RunFolder.open(first), RunFolder.open(second)
-    here, there, *scenes = (
-        _table(read_json(path)) if path.exists() else {}
-        for path in (one.environment, other.environment, one.scene, other.scene)
-    )
+    paths = (one.environment, other.environment, one.scene, other.scene)
+    here, there, *scenes = (_table(read_json(path)) if path.exists() else {} for path in paths)
     environments = [{key: value for key, value in noted.items() if key not in IGNORED} for noted in (here, there)]
     settings = [{"kind": noted.get("kind"), **_table(noted.get("settings"))} for noted in (here, there)]
     unlike, state = partial(differences, missing="missing"), _last_states(one, other)
@@ -47,7 +48,7 @@ def compare_runs(first: Path, second: Path, as_json: bool) -> str:
         "settings": unlike(*settings),
         "environment": unlike(*environments),
         "result": unlike(one.read_result() or {}, other.read_result() or {}),
-        "metrics": _other_steps(settings, scenes) or _metrics(one, other),
+        "metrics": _metrics(one, other, settings, scenes),
         "last_state": state,
     }
     same_state = state is None or (
@@ -59,28 +60,23 @@ def compare_runs(first: Path, second: Path, as_json: bool) -> str:
     if as_json:
         return json.dumps({"equal": equal, **found}, indent=2)
     lines = [f"first: {one.path}", f"second: {other.path}"]
-    lines += [_part("scene", found["scene"]), _part("settings", found["settings"])]
-    lines += [_state(state), _metric_line(found["metrics"])]
-    lines += [_part("result", found["result"]), _part("environment", found["environment"])]
-    return "\n".join([*lines, f"The two runs {'are equal' if equal else 'differ'}."])
+    lines += [_part("scene", found["scene"]), _part("settings", found["settings"]), _state(state)]
+    lines += [_metric_line(found["metrics"]), _part("result", found["result"])]
+    lines += [_part("environment", found["environment"]), f"The two runs {'are equal' if equal else 'differ'}."]
+    return "\n".join(lines)
 
 
 def _table(value: Any) -> dict[str, Any]:
     return dict(value) if isinstance(value, Mapping) else {}
 
 
-def _other_steps(settings: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a note if the two runs have metrics at different times, or an empty dict."""
+def _metrics(one: RunFolder, other: RunFolder, settings: list[dict[str, Any]], scenes: list[Any]) -> dict[str, Any]:
+    """Return the first line that differs, and the greatest differences over all lines, or a note for other times."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
     same = steps[0] == steps[1] and (steps[0] != "auto" or scenes[0] == scenes[1])
-    if same or any(table["kind"] != "run" for table in settings):
-        return {}
-    words = ["a length that is chosen" if step == "auto" else f"{step} s" for step in steps]
-    return {"unlike": f"time steps of {words[0]} and {words[1]} cannot be compared one by one"}
-
-
-def _metrics(one: RunFolder, other: RunFolder) -> dict[str, Any]:
-    """Return the first line with different metrics, and the greatest difference of each metric over all lines."""
+    if not same and all(table["kind"] == "run" for table in settings):
+        words = ["a length that is chosen" if step == "auto" else f"{step} s" for step in steps]
+        return {"unlike": f"time steps of {words[0]} and {words[1]} cannot be compared one by one"}
     rows, others = one.read_metrics(), other.read_metrics()
     found: dict[str, Any] = {} if len(rows) == len(others) else {"lines": [len(rows), len(others)]}
     pairs = [(k, row, twin) for k, (row, twin) in enumerate(zip(rows, others, strict=False)) if row != twin]
@@ -121,12 +117,8 @@ def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
         values = [getattr(frame, name) for frame in frames]
         if all(value is not None for value in values) and values[0].shape == values[1].shape:
             apart = np.linalg.norm(values[0].astype(np.float64) - values[1].astype(np.float64), axis=1)
-            fields[name] = {
-                "unit": unit,
-                "root_mean_square": float(np.sqrt(np.mean(apart**2))),
-                "greatest": float(apart.max()),
-                "particle": int(apart.argmax()),
-            }
+            sizes = {"root_mean_square": float(np.sqrt(np.mean(apart**2))), "greatest": float(apart.max())}
+            fields[name] = {"unit": unit, **sizes, "particle": int(apart.argmax())}
     return {**found, "fields": fields}
 
 
@@ -162,16 +154,13 @@ def _state(state: Mapping[str, Any] | None) -> str:
 
 
 def _metric_line(metrics: Mapping[str, Any]) -> str:
-    if not metrics:
-        return "metrics: the same"
-    if "unlike" in metrics:
-        return f"metrics: {metrics['unlike']}"
-    words = [f"{metrics['lines'][0]} | {metrics['lines'][1]} lines"] if "lines" in metrics else []
+    words = [metrics["unlike"]] if "unlike" in metrics else []
+    words += [f"{metrics['lines'][0]} | {metrics['lines'][1]} lines"] if "lines" in metrics else []
     if "first_different_line" in metrics:
         greatest = ", ".join(f"{name} by {value:.3g}" for name, value in metrics["greatest_difference"].items())
         at_most = f", at most {greatest}" if greatest else ""
         words.append(f"the first that differs is line {metrics['first_different_line']}{at_most}")
-    return f"metrics: {'; '.join(words)}"
+    return f"metrics: {'; '.join(words) or 'the same'}"
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
@@ -185,14 +174,12 @@ def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
     if as_json:
         each = {one.name: {"unit": one.unit, "points": len(one.times), **one.errors} for one in found}
         return json.dumps({"run": str(folder.path), "data": str(data), "plot": str(plot), "errors": each}, indent=2)
-    lines = []
-    for one in found:
-        errors, unit = one.errors, one.unit
-        lines.append(
-            f"{one.name}: simulated less measured {errors['root_mean_square']:.3g} {unit} (root mean square), mean "
-            f"{errors['mean']:.3g} {unit}, at most {errors['greatest']:.3g} {unit} at {errors['greatest_at_s']:g} s; "
-            f"{len(one.times)} points{f', {one.left_out} more are outside of the run' if one.left_out else ''}"
-        )
+    lines = [
+        f"{one.name}: simulated less measured {off['root_mean_square']:.3g} {one.unit} (root mean square), mean "
+        f"{off['mean']:.3g} {one.unit}, at most {off['greatest']:.3g} {one.unit} at {off['greatest_at_s']:g} s; "
+        f"{len(one.times)} points{f', {one.left_out} more are outside of the run' if one.left_out else ''}"
+        for one, off in ((one, one.errors) for one in found)
+    ]
     return "\n".join([*lines, f"The plot is {plot}."])
 
 
@@ -245,17 +232,14 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
         if coarse.size(key) == fine.size(key):
             raise InputError(f"{coarse.path} and {fine.path} have the same {key}, but each run must have another.")
         if abs(coarse.end - fine.end) > SAME_TIME * abs(fine.end):
-            raise InputError(
-                f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s, but all runs must end at "
-                "the same time: choose a --time that is a multiple of every time step."
-            )
+            found = f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s"
+            advice = "choose a --time that is a multiple of every time step"
+            raise InputError(f"{found}, but all runs must end at the same time: {advice}.")
     least, most = (choose(runs, key=lambda run: run.mass) for choose in (min, max))
-    if most.mass > (1.0 + SAME_MASS) * least.mass:  # an order of convergence does not describe that difference
-        warn(
-            f"the runs do not have the same fluid: {least.mass:.4g} kg with a spacing of {least.size(SPACING):g} m, "
-            f"{most.mass:.4g} kg with {most.size(SPACING):g} m. Choose spacings that divide the sizes of all bodies of "
-            "fluid."
-        )
+    if most.mass > 1.005 * least.mass:  # an order of convergence does not describe that difference
+        found = f"{least.mass:.4g} kg with a spacing of {least.size(SPACING):g} m, {most.mass:.4g} kg with"
+        advice = "Choose spacings that divide the sizes of all bodies of fluid."
+        warn(f"the runs do not have the same fluid: {found} {most.size(SPACING):g} m. {advice}")
     rows = []
     for name, (unit, _) in runs[0].numbers.items():
         values = [run.numbers[name][1] for run in runs]
@@ -268,8 +252,7 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
-    """Return the key that varies between the runs: spacing or time step. Raises `InputError` if any other key
-    varies."""
+    """Return the key in which the runs differ, spacing or time step. Raises `InputError` if any other differs."""
     changed: set[str] = set()
     for run in runs[1:]:
         changed |= differences(runs[0].scene, run.scene).keys()
@@ -290,29 +273,13 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
     for row in table["rows"]:
         limit, error, finest = row["limit"], row["error"], row["values"][-1]
         share = f" ({100.0 * error / abs(finest):.2g} %)" if error is not None and finest else ""
-        lines.append(
-            [
-                f"{row['name']} [{row['unit']}]" if row["unit"] else row["name"],
-                *(f"{value:.6g}" for value in row["values"]),
-                "" if row["order"] is None else f"{row['order']:.2f}",
-                "" if limit is None else f"{limit:.6g}",
-                "" if error is None else f"{error:.2g}{share}",
-                row["flag"],
-            ]
-        )
+        name = f"{row['name']} [{row['unit']}]" if row["unit"] else row["name"]
+        found = ["" if row["order"] is None else f"{row['order']:.2f}", "" if limit is None else f"{limit:.6g}"]
+        found += ["" if error is None else f"{error:.2g}{share}", row["flag"]]
+        lines.append([name, *(f"{value:.6g}" for value in row["values"]), *found])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     aligned = ("  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in lines)
     return "\n".join([f"{len(table['runs'])} runs until {table['end_s']:g} s, by {key}", *aligned])
-
-
-LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
-"""Range of possible orders of convergence."""
-LOWEST, HIGHEST = 0.5, 2.0
-"""Range of trusted orders of convergence."""
-ROUND_OFF = 1e-6
-"""Relative tolerance at the ends of the trusted range."""
-SAFE, UNSURE = 1.25, 3.0
-"""Safety factors of Roache (1994): with three sizes and a trusted order, and without."""
 
 
 @dataclass(frozen=True)
@@ -359,6 +326,6 @@ class Extrapolation:
 
         order = float(brentq(excess, LEAST_ORDER, MOST_ORDER, xtol=1e-12))
         used = min(max(order, LOWEST), HIGHEST)
-        away, is_believed = fine / (r_21**used - 1.0), isclose(used, order, rel_tol=ROUND_OFF)
+        away, is_believed = fine / (r_21**used - 1.0), isclose(used, order, rel_tol=1e-6)
         flag = "" if is_believed else f"the order is taken as {used:g}"
         return cls(order, f_1 - away, (SAFE if is_believed else UNSURE) * abs(away), flag)

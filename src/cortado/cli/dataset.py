@@ -32,8 +32,6 @@ from cortado.scene.tables import sentences as in_sentences
 from cortado.simulation import Simulation
 from cortado.version import __version__
 
-ASKED = "dataset.json"
-"""File name of the settings of a data set."""
 MOST_RUNS = 100_000
 
 
@@ -49,9 +47,8 @@ class Member:
     precision: str
 
     def scene(self, number: int) -> Scene:
-        return load_scene(self.file, [*self.overrides, *Sample(self.table, number).overrides]).lasting(
-            steps=self.table.steps
-        )
+        overrides = [*self.overrides, *Sample(self.table, number).overrides]
+        return load_scene(self.file, overrides).lasting(steps=self.table.steps)
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
         """Compute and write a run. Return whether it succeeded, and its warnings."""
@@ -95,9 +92,8 @@ def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str
 
         def kept() -> str:
             now = DatasetFolder(member.out)
-            there = sum(number in now.runs or number in now.failures for number in range(runs))
-            said = f"{there} of {counted(runs, 'run')} are finished, in {member.out}"
-            return f"{said}; the same command goes on with the rest"
+            there = f"{sum(k in now.runs or k in now.failures for k in range(runs))} of {counted(runs, 'run')}"
+            return f"{there} are finished, in {member.out}; the same command goes on with the rest"
 
         told: dict[int, list[str]] = {}
         failed = 0
@@ -137,8 +133,7 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
-    """Write the files of the data set and return the metadata. Raises `ComputationError` if training, validation or
-    test has no run."""
+    """Write the files of the data set, and return the metadata. Raises `ComputationError` if a part has no runs."""
     folder = DatasetFolder(member.out)
     there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
     for purpose, numbers in split.items():
@@ -192,9 +187,8 @@ def _asked(member: Member) -> dict[str, Any]:
 
 
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
-    """Write the settings into the folder of the data set and remove unfinished files. Raises `InputError` if the folder
-    contains unknown files."""
-    note = out / ASKED
+    """Note the settings of the data set in its folder and clean it. Raises `InputError` for unknown files."""
+    note = out / "dataset.json"
     for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
         left_behind.unlink(missing_ok=True)
     if note.exists():

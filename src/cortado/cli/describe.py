@@ -1,5 +1,4 @@
-"""The commands ``cortado describe`` and ``cortado gradients check``. ``describe`` estimates the cost of a run, and
-``gradients check`` computes the certificate of a scene's gradients."""
+"""The commands ``cortado describe``, of a scene and what its run costs, and ``cortado gradients check``."""
 
 import json
 import math
@@ -17,6 +16,7 @@ import warp as wp
 from cortado.arrays import check_steps
 from cortado.calls import counted, point_in_words
 from cortado.certificate import certify
+from cortado.cli.run import RunRequest
 from cortado.device.threads import frame_parts, gradient_parts, simulation_parts, step_parts
 from cortado.discretise.shapes import EXCESS
 from cortado.errors import ComputationError, DivergedError, InputError, shown
@@ -42,20 +42,14 @@ from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
 
-MANY = 1_000_000
-"""Number of particles above which a note about the waiting time is printed."""
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
 """Least and greatest number of timed steps, and sufficient time for timing [s]."""
 SAME = 1e-6
 """Relative tolerance for time steps that are rounded to float32."""
-MOST_FRAMES = 1_000_000
-HEADS, PER_PARTICLE, PER_STEP = 28e3, 24.0, 50.0
-"""Sizes in a trajectory file [bytes]: headers, constants of a particle, and diagnostics of a step."""
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Time a few steps, and return their number and the time of one step [s]. Raises `DivergedError` if the scene
-    diverges."""
+    """Time some steps. Return their number and the time of one [s]. Raises `DivergedError` if they diverge."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -88,52 +82,24 @@ class RunLength:
         if frames is not None:
             numbers = simulation.numbers_in_frame(components=3)  # as in the file
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
-            self.trajectory = size + (HEADS + PER_PARTICLE * simulation.particles + PER_STEP * self.steps)
+            self.trajectory = size + (28e3 + 24.0 * simulation.particles + 50.0 * self.steps)  # headers and diagnostics
         self.film: Pace | None = None
         """Frames of the film, or None without a film or for an unknown length."""
-        if frames is not None and time is not None and 1 < frames <= MOST_FRAMES and picture.film_frames != 0:
+        if frames is not None and time is not None and 1 < frames <= 1_000_000 and picture.film_frames != 0:
             times = np.linspace(0.0, time, frames)
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
 
-    def for_machines(self) -> dict[str, Any]:
-        film = {} if self.film is None else {"film_seconds": self.film.seconds, "film_speed": self.film.speed}
-        return {
-            "steps": self.steps,
-            "steps_are_estimated": self.is_about,
-            "simulated_time_s": self.time,
-            "frames": self.frames,
-            "trajectory_bytes": self.trajectory,
-            "film_frames": None if self.film is None else len(self.film.frames),
-            **film,
-        }
 
-    @property
-    def in_words(self) -> str:
-        motion = "" if self.time is None else f", {self.time:g} s of motion"
-        about = "about " if self.is_about else ""
-        guess = ", if fluid gets as fast as by a fall through the whole container" if self.is_about else ""
-        return f"{about}{counted(self.steps, 'step')}{motion}{guess}"
-
-
-def describe_scene(
-    scene_file: Path,
-    steps: int | None,
-    time: float | None,
-    frames: FrameChoice,
-    overrides: list[str],
-    device: str,
-    precision: str,
-    picture: Path | None,
-    as_json: bool,
-) -> str:
+def describe_scene(scene_file: Path, asked: RunRequest, picture: Path | None, as_json: bool) -> str:
     """Describe a scene as text or as JSON. If ``picture`` is a path, a picture of the initial state is drawn there."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
-    of_search = overrides_of(overrides, ("problem", "optimise")) if "optimise" in read_toml(scene_file) else []
-    scene = load_scene(scene_file, [one for one in overrides if one not in of_search]).lasting(time, steps)
+    is_task, steps, time = "optimise" in read_toml(scene_file), asked.steps, asked.time
+    of_search = overrides_of(asked.overrides, ("problem", "optimise")) if is_task else []
+    scene = load_scene(scene_file, [one for one in asked.overrides if one not in of_search]).lasting(time, steps)
     count = sum(body.count(scene.discretisation.spacing) for body in (*scene.fluid, *scene.emitter))
-    with timed_note(f"About {count:,.0f} particles are made") if count > MANY else nullcontext():
-        simulation = Simulation(scene, device, precision)
+    with timed_note(f"About {count:,.0f} particles are made") if count > 1e6 else nullcontext():
+        simulation = Simulation(scene, asked.device, asked.precision)
     drawn = {}
     if picture is not None:
         make_folder(picture.parent)
@@ -142,11 +108,10 @@ def describe_scene(
         write_picture(picture, plan(scene, simulation.positions[free], colours, simulation.device))
         drawn = {"picture": str(picture.absolute())}
     note("Some steps and pictures are timed.")
-    found = _described(simulation, length := RunLength(simulation, steps, time, frames))
+    found = _described(simulation, length := RunLength(simulation, steps, time, asked.frames))
     for quality in ("traced", "quick")[: 0 if length.film is None else scene.dimension - 1]:
         found[f"{quality}_picture_seconds".removeprefix("traced_")] = seconds_of_picture(simulation, quality)
-    if "optimise" in read_toml(scene_file):
-        found["search"] = task_in_words(load_task(scene_file, overrides))
+    found |= {"search": task_in_words(load_task(scene_file, asked.overrides))} if is_task else {}
     found |= drawn
     return json.dumps(found, indent=2) if as_json else _as_text(found, length)
 
@@ -155,7 +120,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
     scene = simulation.scene
     of_phase = Counter(np.argmax(simulation.mass_fractions, axis=1).tolist())
     (size, limits, chosen_by), ends = _time_step(simulation), scene.container.extent()
-    masses, spacing = simulation.masses, scene.discretisation.spacing
+    masses, spacing, film = simulation.masses, scene.discretisation.spacing, length.film
     columns = [emitter.particles(spacing) for emitter in scene.emitter]  # what they hold in reserve is not to be seen
     fluid = np.concatenate([simulation.positions[: simulation.free_particles], *columns])
     viscosity, limit = str(scene.forces.viscosity), viscous_limit(scene, {})
@@ -184,7 +149,13 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
         "scheduled_until_s": {name: course.times[-1] for name, course in scene.schedule.courses.items()},
         "device": str(simulation.device),
         "precision": simulation.precision.name,
-        **length.for_machines(),
+        "steps": length.steps,
+        "steps_are_estimated": length.is_about,
+        "simulated_time_s": length.time,
+        "frames": length.frames,
+        "trajectory_bytes": length.trajectory,
+        "film_frames": None if film is None else len(film.frames),
+        **({} if film is None else {"film_seconds": film.seconds, "film_speed": film.speed}),
         "memory_bytes": None,
         "gradient_memory_bytes": None,
     }
@@ -203,8 +174,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the time step [s], its limits [s] by name, and the limit of the first step. For fixed time steps the last
-    value is None."""
+    """Return the time step [s], its limits [s] by name, and the limit of the first step, or None for a fixed step."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -241,13 +211,10 @@ def seconds_of_picture(simulation: Simulation, quality: str) -> float | None:
 
 
 def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, float]:
-    """Estimate the memory of a forward run and the memory of a run with its gradient [bytes]. A checkpoint of every
-    step is assumed."""
-    particles, walls, real = simulation.particles, len(simulation.walls), simulation.precision.bytes
-    solver = simulation.solver
+    """Estimate the memory of a run, and of a run with its gradient and a checkpoint of every step [bytes]."""
+    particles, real, solver = simulation.particles, simulation.precision.bytes, simulation.solver
     assert isinstance(solver, ParticleSolver)
-    capacity = solver.search.capacity
-    forward = sum(simulation_parts(particles, walls, capacity, real).values())
+    forward = sum(simulation_parts(particles, len(simulation.walls), solver.search.capacity, real).values())
     counts = rollout.diagnostics.get("iterations")  # a solver of one's own may have none
     iterations = 0 if counts is None else int(counts.max(initial=0))
     checkpoints = rollout.steps * sum(array.capacity for array in rollout.initial.arrays())
@@ -255,9 +222,8 @@ def estimated_bytes(simulation: Simulation, rollout: Rollout) -> tuple[float, fl
 
 
 def _as_text(found: dict[str, Any], length: RunLength) -> str:
-    fluid, held = (
-        " x ".join(f"{side:.3g}" for side in found[key] or ()) for key in ("fluid_size_m", "container_size_m")
-    )
+    sizes = found["fluid_size_m"], found["container_size_m"] or ()
+    fluid, held = (" x ".join(f"{side:.3g}" for side in size) for size in sizes)
     masses, gravity = ", ".join(found["mass_in_words"]), point_in_words(found["gravity_m_s2"])
     layer = " in a layer of 1 m" if found["dimension"] == 2 else ""
     container = f", in a container of {held} m" if held else ""
@@ -270,28 +236,24 @@ def _as_text(found: dict[str, Any], length: RunLength) -> str:
     chosen = found["time_step_chosen_by"]
     run, backward = (_bytes(found[f"{name}memory_bytes"]) for name in ("", "gradient_"))
     allowed = f"stable up to about {least:.3g} s{beyond}; limits: {by_name}" if limits else "nothing limits it"
+    step = f"{found['time_step_s']:g} s; {allowed}"
+    if chosen:
+        step = f"chosen before each step: the first is {found['time_step_s']:.3g} s, by {chosen}; limits: {by_name}"
+    stored = "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
+    if length.frames is not None:
+        stored = f"{_bytes(length.trajectory)} on disk, {counted(length.frames, 'frame')}; --fps or --record-every says"
+        stored += " how many"
     rows = [
         ("particles", f"{found['particles']} of fluid ({phases}{waiting}), {found['wall_particles']} of walls"),
         ("spacing", f"{found['spacing_m']:g} m, in {found['dimension']}-D"),
         # lengths and masses, in which a wrong unit is easy to see
         ("size", f"fluid in {fluid} m{container}; {masses}{layer}; gravity {gravity} m/s2"),
-        (
-            "time step",
-            f"chosen before each step: the first is {found['time_step_s']:.3g} s, by {chosen}; limits: {by_name}"
-            if chosen
-            else f"{found['time_step_s']:g} s; {allowed}",
-        ),
+        ("time step", step),
         ("viscosity", found["viscosity"]),
         *(("emitter", _emitter(one, found["dimension"], length)) for one in found["emitters"]),
         ("memory", f"{run} for a run, {backward} for a gradient, beside Python and Warp themselves"),
         ("time", _time(found, length)),
-        (
-            "trajectory",
-            "unknown, as nobody knows what time so many chosen steps simulate; --time says it"
-            if length.frames is None
-            else f"{_bytes(length.trajectory)} on disk, {counted(length.frames, 'frame')}; --fps or --record-every says"
-            " how many",
-        ),
+        ("trajectory", stored),
         ("film", _film(length, found.get("picture_seconds"), found.get("quick_picture_seconds"))),
     ]
     courses = [f"{name} changes until {last:g} s" for name, last in found["scheduled_until_s"].items()]
@@ -322,16 +284,18 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
     if found["particles_in_emitter"]:
         slower = "later ones take longer, as fluid comes out of emitters"
     read = f"with {counted(found['sensors'], 'sensor')}, " if found["sensors"] else ""
+    motion = "" if length.time is None else f", {length.time:g} s of motion"
+    about = "about " if length.is_about else ""
+    guess = ", if fluid gets as fast as by a fall through the whole container" if length.is_about else ""
     return (
         f"{found['milliseconds_per_step']:.3g} ms a step on {found['device']} in {found['precision']}, {read}without "
         f"what is recorded (mean of the first {found['measured_steps']} steps; {slower}); "
-        f"{length.in_words}: {_duration(found['expected_seconds'])}"
+        f"{about}{counted(length.steps, 'step')}{motion}{guess}: {_duration(found['expected_seconds'])}"
     )
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Describe the frames and length of a film, and the time to draw it. ``traced`` and ``quick`` are the times of one
-    picture [s]."""
+    """Describe a film and the time to draw it. One picture takes ``traced`` or ``quick`` seconds."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:
@@ -355,9 +319,6 @@ def _bytes(size: float | None) -> str:
     return f"about {size / 1e9:.2g} GB" if size >= 1e9 else f"about {max(size / 1e6, 0.1):.2g} MB"
 
 
-LOSSES = ("positions", "centre-of-mass", "image")
-
-
 def check_scene(
     scene_file: Path,
     steps: int,
@@ -371,8 +332,8 @@ def check_scene(
     seed: int,
 ) -> str:
     """Return the certificate of a scene's gradients as text. Raises `ComputationError` if a derivative is wrong."""
-    if loss not in LOSSES:
-        raise InputError(f"--loss is {shown(loss)}, but must be one of {', '.join(LOSSES)}.")
+    if loss not in ("positions", "centre-of-mass", "image"):
+        raise InputError(f"--loss is {shown(loss)}, but must be one of positions, centre-of-mass, image.")
     scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))
     simulation = Simulation(scene, device, "float64")
     measure: Loss = FinalPositions(simulation.positions)  # of how far the fluid has moved from its initial state

@@ -32,8 +32,7 @@ SWEEP = "sweep.csv"
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
-    """Return the runs in the given folders, and all runs of a given sweep. Raises `InputError` for a folder without a
-    run."""
+    """Return the runs in the folders, with all runs of a sweep. Raises `InputError` for a folder without a run."""
     if not folders:
         raise InputError("RUN is missing, but must be the folder of a run, or of a sweep.")
     found: list[RunFolder] = []
@@ -53,8 +52,7 @@ class OwnQuantity:
     """A user-defined function of a trajectory that returns a number."""
 
     def __init__(self, where: str):
-        """Load the function from ``FILE.py:FUNCTION``. Raises `InputError` if the file fails or does not define the
-        function."""
+        """Load the function from ``FILE.py:FUNCTION``. Raises `InputError` if the file fails or lacks the function."""
         file, _, name = where.rpartition(":")
         if not file.endswith(".py") or not name.isidentifier():
             raise InputError(f"--quantity is {shown(where)}, but must be FILE.py:FUNCTION.")
@@ -67,8 +65,7 @@ class OwnQuantity:
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
-        """Return the function's value for a trajectory. Raises `InputError` if the function fails or returns
-        no number."""
+        """Return the value for a trajectory. Raises `InputError` if the function fails or returns no number."""
         try:
             found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
@@ -97,9 +94,8 @@ def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
     """Read the scene of an existing run, with overrides of [picture]."""
     for override in overrides:
         if not override.startswith("picture."):
-            raise InputError(
-                f"--set is {override}, but must begin with picture., as the run has been computed already."
-            )
+            wanted = "must begin with picture., as the run has been computed already"
+            raise InputError(f"--set is {override}, but {wanted}.")
     folder.require_files()
     return folder.read_scene(overrides)
 
@@ -127,8 +123,7 @@ def draw_runs(
     if as_film and picture.film_frames == 0:
         raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
     if len(each) == 1:
-        (one,) = each
-        page, times = run_page(one, device), one.times
+        page, times = run_page(each[0], device), each[0].times
         place, name = folders[0].figures, "film" if as_film else "picture"
     else:
         names = [folder.path.name for folder in folders]
@@ -156,15 +151,14 @@ def draw_runs(
 
 def _trajectory(folder: RunFolder) -> Trajectory:
     if not folder.trajectory.exists():
-        raise InputError(f"{folder.path} has no trajectory; the pictures of a search are in {folder.figures}.")
+        found = f"{folder.path} has no trajectory, but must be the folder of a run of a scene"
+        raise InputError(f"{found}; the pictures of a search are in {folder.figures}.")
     return Trajectory.load(folder.trajectory)
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:
     """Export every ``every``-th frame of a run in the format ``to``. Returns a sentence that names the files."""
     folder = RunFolder.open(run)
-    if not folder.trajectory.exists():
-        raise InputError(f"{folder.path} has no trajectory, but must be the folder of a run of a scene.")
-    trajectory, scene = Trajectory.load(folder.trajectory)[::every], scene_of_run(folder, overrides)
+    trajectory, scene = _trajectory(folder)[::every], scene_of_run(folder, overrides)
     found = export(trajectory, folder.path / to if out is None else out, to, scene, lambda: Simulation(scene))
     return f"The run is in {found}."

@@ -1,5 +1,4 @@
-"""The commands ``cortado optimise`` and ``cortado fit``. ``optimise`` solves the inverse problem of a task, and ``fit``
-estimates parameters with error bars from measurements."""
+"""The commands ``cortado optimise``, for inverse problems, and ``cortado fit``, for estimates with error bars."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -11,7 +10,8 @@ import numpy as np
 
 from cortado.calls import counted
 from cortado.cli.arguments import HERE, Where
-from cortado.cli.optimise_report import Solved, asked
+from cortado.cli.optimise_report import Solved, question
+from cortado.cli.run import RunRequest
 from cortado.device.modules import compile_meanwhile
 from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
@@ -34,43 +34,30 @@ from cortado.pictures.painter import painter
 from cortado.runs.run_folder import TO_RESUME, RunFolder
 from cortado.scene.scene import scene_in_words
 
+COUNTED = (
+    "The last column is what the error would be if every number that was measured were independent of all others: it "
+    "shows how much correlation matters."
+)
 
-def optimise_task(
-    task_file: Path,
-    out: Path,
-    overrides: list[str],
-    device: str,
-    precision: str,
-    resume: bool,
-    overwrite: bool,
-    command: list[str],
-    where: Where = HERE,
-    pictures: bool = False,
-) -> str:
-    """Optimise a task and return a sentence that names the results. The samples of ensembles are computed by
-    ``where``."""
-    task = load_task(task_file, overrides)
+
+def optimise_task(task_file: Path, asked: RunRequest, where: Where = HERE) -> str:
+    """Optimise a task and return a sentence that names the results. ``where`` computes the samples of ensembles."""
+    task = load_task(task_file, asked.overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
-    made = setup(task, device, precision)
-    if resume:
-        RunFolder.open(out, TO_RESUME)
-    with where.executor(device, task.optimise.gradient.samples) as executor, locked(out):
-        given = out, task.scene.to_json(), command
-        noted: dict[str, Any] = {"kind": "optimise", "settings": search_settings(task, precision)}
-        noted["device"] = str(made.problem.simulation.device)
-        folder = RunFolder.resume(*given, **noted) if resume else RunFolder.create(*given, overwrite=overwrite, **noted)
+    made = setup(task, asked.device, asked.precision)
+    if asked.resume:
+        RunFolder.open(asked.out, TO_RESUME)
+    with where.executor(asked.device, task.optimise.gradient.samples) as executor, locked(asked.out):
+        folder = asked.folder(task.scene, made.problem.simulation, "optimise", search_settings(task, asked.precision))
         with keeping(lambda: f"{_kept(folder)}; --resume goes on with them" if _kept(folder) else ""):
-            return _solved(made, folder, resume, executor, pictures)
+            return _solved(made, folder, asked.resume, executor, asked.pictures)
 
 
 def search_settings(task: Task, precision: str) -> dict[str, Any]:
     """Return the settings that must not change when a search is resumed."""
-    return {
-        "precision": precision,
-        "problem": task.problem.model_dump(),
-        "optimise": task.optimise.model_dump(exclude={"iterations", "check"}),
-    }
+    search = task.optimise.model_dump(exclude={"iterations", "check"})
+    return {"precision": precision, "problem": task.problem.model_dump(), "optimise": search}
 
 
 def _kept(folder: RunFolder) -> str:
@@ -90,7 +77,7 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     except DivergedError as error:
         evaluations = len(folder.read_metrics())
         ended = Section("What came out", [f"The search ended early, in evaluation {evaluations}."], [error])
-        write_report(folder, made.task.scene.name, [asked(made), ended])
+        write_report(folder, made.task.scene.name, [question(made), ended])
         told = error.with_advice("; ".join(filter(None, [error.advice, _kept(folder)])))
         folder.write_result(evaluations=evaluations, failures=[str(told)])
         raise told from error
@@ -134,17 +121,10 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
             show(made_updates, loss=record.loss, evaluations=len(history))
 
         for k, search in enumerate(made.searches):
-            result = optimise(
-                search,
-                start,
-                settings.algorithm(),
-                settings.iterations,
-                bounds=made.bounds,
-                gradient=settings.gradient.estimator(executor),
-                checkpoint=folder.checkpoint / str(k) if k else folder.checkpoint,
-                resume=resume,
-                on_iteration=keep,
-            )
+            place = folder.checkpoint / str(k) if k else folder.checkpoint
+            own: dict[str, Any] = {"gradient": settings.gradient.estimator(executor), "on_iteration": keep}
+            own |= {"bounds": made.bounds, "checkpoint": place, "resume": resume}
+            result = optimise(search, start, settings.algorithm(), settings.iterations, **own)
             if result.updates > result.history[-1].updates:
                 show(result.updates)
             start, updates = result.last_parameters, updates + result.updates
@@ -153,22 +133,14 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
     return replace(result, history=tuple(history), **whole)
 
 
-COUNTED = (
-    "The last column is what the error would be if every number that was measured were independent of all others: it "
-    "shows how much correlation matters."
-)
-
-
-def fit_task(
-    task_file: Path, out: Path, overrides: list[str], device: str, precision: str, overwrite: bool, command: list[str]
-) -> str:
+def fit_task(task_file: Path, asked: RunRequest) -> str:
     """Fit the parameters of a task, write the run folder, and return a sentence that names the results."""
-    task = load_fit(task_file, overrides)
-    experiments = [one.experiment(device, precision) for one in task.experiments]
-    with locked(out):
-        settings = {"precision": precision, "fit": task.fit.model_dump()}
-        noted: dict[str, Any] = {"kind": "fit", "settings": settings, "device": device}
-        folder = RunFolder.create(out, task.scene.to_json(), command, overwrite=overwrite, **noted)
+    task = load_fit(task_file, asked.overrides)
+    experiments = [one.experiment(asked.device, asked.precision) for one in task.experiments]
+    with locked(asked.out):
+        settings = {"precision": asked.precision, "fit": task.fit.model_dump()}
+        noted: dict[str, Any] = {"kind": "fit", "settings": settings, "device": asked.device}
+        folder = RunFolder.create(asked.out, task.scene.to_json(), asked.command, overwrite=asked.overwrite, **noted)
         with track(2 * task.fit.iterations, "fit") as advance:
             given = task.fit
             fitted = fit(experiments, given.start, given.bounds, given.iterations, lambda: advance(1), given.starts)
@@ -181,10 +153,9 @@ def fit_task(
         write_report(folder, task.scene.name, fit_sections(task, fitted, profiles, folder.figures))
         folder.write_result(**fit_for_machines(fitted, profiles))
     if not fitted.converged:
-        raise ComputationError(
-            f"The fit has not converged in {task.fit.iterations} trial points: increase fit.iterations, or start "
-            f"nearer to the expected values. The results are in {folder.path}."
-        )
+        found = f"The fit has not converged in {task.fit.iterations} trial points"
+        advice = "increase fit.iterations, or start nearer to the expected values"
+        raise ComputationError(f"{found}: {advice}. The results are in {folder.path}.")
     doubted = " They are in doubt, as said above." if fitted.in_doubt else ""
     return f"The results are in {folder.path}; open report.html.{doubted}"
 
@@ -202,13 +173,10 @@ def fit_sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder
     ]
     head = ("", "unit", "start", "found", "standard error", "95 %, from", "to", "degrees of freedom", "counted error")
     counted_errors = np.sqrt(np.diag(fitted.naive_covariance)) * fitted.coordinates.slopes(fitted.u)
-    rows: list[tuple[object, ...]] = [
-        (
-            *(one.label.replace("_", " "), unit_of(one.label), one.start, one.value, one.error, one.lower, one.upper),
-            *(round(float(freedom), 1), float(error)),
-        )
-        for one, freedom, error in zip(fitted.numbers(), fitted.degrees_of_freedom, counted_errors, strict=True)
-    ]
+    rows = list[tuple[object, ...]]()
+    for one, freedom, error in zip(fitted.numbers(), fitted.degrees_of_freedom, counted_errors, strict=True):
+        own = (unit_of(one.label), one.start, one.value, one.error, one.lower, one.upper)
+        rows.append((one.label.replace("_", " "), *own, round(float(freedom), 1), float(error)))
     noise_head = ("", "unit", "frames", "numbers", "residuals", "noise", "correlation time [s]", "independent frames")
     noise: list[tuple[object, ...]] = []
     for part in fitted.parts:

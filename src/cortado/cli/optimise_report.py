@@ -19,16 +19,8 @@ from cortado.scene.parameter_values import Arrays
 from cortado.scene.scene import scene_in_words
 
 Rows = list[tuple[object, ...]]
-
-LITTLE = 2.0
-"""Least reduction factor of the loss in a successful search."""
-LONG = 100
-"""Number of steps above which chaotic gradients may explain an unsuccessful search."""
 MOST_ERROR = 0.3
 """Greatest relative error of a found parameter."""
-MOST_IN_RESULT = 1000
-"""Greatest size of a parameter in result.json. The checkpoint contains all parameters."""
-VIEWED = 60
 
 
 @dataclass(frozen=True)
@@ -88,7 +80,7 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def asked(made: Setup) -> Section:
+def question(made: Setup) -> Section:
     scene = scene_in_words(made.task.scene, made.problem.simulation.particles)
     return Section("What was asked", [*task_in_words(made.task), f"The scene: {scene}"])
 
@@ -121,8 +113,7 @@ class Solved:
         return f"{'; '.join([text, *reached])}."
 
     def _worst(self, name: str, error: float) -> str:
-        """Describe a parameter's component with the greatest error, if that error is more than twice the parameter's
-        error."""
+        """Describe the component with the greatest error, if it is more than twice the parameter's ``error``."""
         estimate, true = self.estimate[name], self.made.true_parameter(name)
         names = component_names(self.made.task, name, estimate)
         if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
@@ -141,10 +132,10 @@ class Solved:
             most = np.asarray(np.inf if upper is None else upper)
             if ((result.parameters[name] <= least) | (result.parameters[name] >= most)).any():
                 found.append(f"The search of {name} ended on its bounds: what is best may lie beyond them.")
-        hardly, is_exact = self.verdict.reduction < LITTLE, task.optimise.gradient.name == "exact"
+        hardly, is_exact = self.verdict.reduction < 2.0, task.optimise.gradient.name == "exact"
         search = 'optimise.optimiser = "line_search"'
         disagrees = "The gradient disagrees with what steps of the search did"
-        if is_exact and (result.misled or (hardly and steps >= LONG)):
+        if is_exact and (result.misled or (hardly and steps >= 100)):
             found.append(
                 f"{disagrees if result.misled else 'The loss hardly fell'}. Over {steps} steps the exact gradient may "
                 "mean nothing: cortado gradients check says up to which step it is of use. Beyond it set "
@@ -209,7 +200,7 @@ class Solved:
     def sections(self, figures: TaskFigures) -> list[Section]:
         made, result, verdict, task = self.made, self.result, self.verdict, self.made.task
         steps, unit = made.problem.steps, "" if made.renderer else "m²"
-        viewed = np.unique(np.linspace(0, steps, VIEWED).astype(int)).tolist()
+        viewed = np.unique(np.linspace(0, steps, 60).astype(int)).tolist()
         runs = {"found": self.estimate, **({"target": task.true_parameters} if task.problem.picture is None else {})}
         states = {name: made.problem.states(parameters, viewed) for name, parameters in runs.items()}
         shown = {name: [found[step] for step in viewed] for name, found in states.items()}
@@ -228,7 +219,7 @@ class Solved:
         view = scene_view(task.scene, shown, np.array(viewed) * task.scene.solver.time_step)
         head = ("", "unit", "first guess", "found", "hidden", "error")
         return [
-            asked(made),
+            question(made),
             Section("What was found", [self.summary, *self.advice], verdict.failures, figures.found),
             Section("In numbers", head=head, rows=self.rows),
             Section("To turn and to play", view=view),
@@ -239,7 +230,7 @@ class Solved:
 
     def for_machines(self) -> dict[str, Any]:
         """Return the contents of result.json."""
-        result, verdict, small = self.result, self.verdict, MOST_IN_RESULT
+        result, verdict, small = self.result, self.verdict, 1000  # the checkpoint has all of them
         return {
             "evaluations": len(result.history),
             "refused": result.refused,

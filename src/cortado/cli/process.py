@@ -18,9 +18,6 @@ from cortado.errors import LONGEST, ComputationError, CortadoError, CortadoWarni
 from cortado.files.terminal import Interrupted, say, tell, to_stdout
 from cortado.version import __version__
 
-BROKEN_PIPE = 141
-"""Exit code after a closed output pipe, as for a process ended by SIGPIPE."""
-
 
 def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -44,7 +41,7 @@ def main(arguments: Sequence[str] | None = None, program: Program = CORTADO) -> 
         say(str(stop))
         sys.exit(stop.code)
     except BrokenPipeError:
-        sys.exit(BROKEN_PIPE)
+        sys.exit(141)  # as for a process that SIGPIPE ends
     except Exception as error:
         from cortado.device.modules import complaint
 
@@ -81,15 +78,12 @@ _COMMAND = re.compile(
     r"(new|examples|describe|run|compare|convergence|optimise|fit|picture|export|view|sweep|dataset|schema|completion"
     r"|gradients( check)?|figure|study)(?= |$)"
 )
-_EDGES = "│|╭╮╰╯─-+ "
 
 
 def _unknown_command(match: re.Match[str]) -> str:
     word, commands = match.groups()
     close = get_close_matches(word, commands.split(", "), n=1)
-    return (
-        f"{word} is unknown; {close[0]} may be meant" if close else f"{word} is unknown, but must be one of {commands}"
-    )
+    return f"{word} is unknown{f'; {close[0]} may be meant' if close else f', but must be one of {commands}'}"
 
 
 _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
@@ -114,7 +108,7 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
     """Replace tyro's boxed error message by a sentence."""
     words = " ".join(arguments)
-    lines = ["" if set(line) <= set(_EDGES) else line.strip("│| ") for line in box.splitlines()[1:]]
+    lines = ["" if set(line) <= set("│|╭╮╰╯─-+ ") else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)
     text = re.split(r" (?:Argument helptext:|For full helptext,)", text)[0].rstrip(". ")
     found = ((re.fullmatch(theirs, text), ours) for theirs, ours in _SENTENCES)
@@ -124,22 +118,16 @@ def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado")
     return f"{said}; see {program} {f'{command[0]} ' if command else ''}--help."
 
 
-_MEMORY = (os.strerror(ENOMEM), "failed to map segment")
-_FILES = (os.strerror(EMFILE), os.strerror(ENFILE))
-_THREADS = ("can't start new thread",)
-"""Error texts that reveal a lack of threads."""
-
-
 def shortage(error: BaseException | None) -> str | None:
     """Return a sentence if an error was caused by a lack of memory, files or threads, or None."""
     while error is not None:
         said = str(error) if isinstance(error, OSError | ImportError | RuntimeError) else ""
-        if isinstance(error, MemoryError) or any(word in said for word in _MEMORY):
+        if isinstance(error, MemoryError) or os.strerror(ENOMEM) in said or "failed to map segment" in said:
             what = f" ({error})" if str(error) else ""
             return f"Memory ran out{what}; take a larger spacing, or record fewer frames with --record-every."
-        if any(word in said for word in _FILES):
+        if os.strerror(EMFILE) in said or os.strerror(ENFILE) in said:
             return f"Too many files are open ({error}); allow this process more of them (ulimit -n 1024)."
-        if any(word in said for word in _THREADS):
+        if "can't start new thread" in said:
             return "No more threads can be started; allow this process more of them (ulimit -u) or more memory."
         error = error.__cause__ or error.__context__
     return None

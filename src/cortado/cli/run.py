@@ -26,7 +26,7 @@ from cortado.runs.recording import EverySteps, FrameChoice
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.restart import RestartState
-from cortado.scene.scene import load_scene
+from cortado.scene.scene import Scene, load_scene
 from cortado.simulation import Simulation
 from cortado.watching import Watch
 
@@ -36,6 +36,8 @@ OFTEN, SHARE = 5.0, 20.0
 
 @dataclass(frozen=True)
 class RunRequest:
+    """What a command asks of a run, a search or a fit."""
+
     out: Path
     steps: int | None = None
     time: float | None = None
@@ -54,9 +56,17 @@ class RunRequest:
     command: Sequence[str] = ()
     report: bool = True
 
+    def folder(self, scene: Scene, simulation: Simulation, kind: str, settings: dict[str, Any]) -> RunFolder:
+        """Make the folder of the run, or open it for going on."""
+        given = self.out, scene.to_json(), self.command
+        noted: dict[str, Any] = {"kind": kind, "settings": settings, "device": str(simulation.device)}
+        if self.resume:
+            return RunFolder.resume(*given, **noted)
+        return RunFolder.create(*given, overwrite=self.overwrite, **noted)
+
     def settings(self, rollout: Rollout, state: RestartState | None) -> dict[str, Any]:
         """Return the settings that must not change when the run is resumed."""
-        found = run_settings(rollout.steps, self.precision, self.frames)
+        found = {"steps": rollout.steps, "precision": self.precision, **self.frames.settings}
         if np.isfinite(rollout.step_sizes.end):
             found |= {"steps": None, "time": self.time}
         if self.record:
@@ -66,10 +76,6 @@ class RunRequest:
             content = told + b"".join(state[name].tobytes() for name in sorted(state.fields))
             found["state"] = sha256(content).hexdigest()[:16]
         return found
-
-
-def run_settings(steps: int, precision: str, frames: FrameChoice) -> dict[str, Any]:
-    return {"steps": steps, "precision": precision, **frames.settings}
 
 
 @dataclass
@@ -192,18 +198,14 @@ def run_scene(scene_file: Path, asked: RunRequest) -> str:
     numbers = simulation.numbers_in_frame(components=3)  # as in the file
     frames = frame_parts(asked.frames.expected(rollout), numbers, simulation.precision.bytes)
     require(frames, "take a larger --record-every or fewer steps")
-    watch, given = Watch(simulation, rollout, asked.record), (asked.out, scene.to_json(), asked.command)
-    noted: dict[str, Any] = {"device": str(simulation.device), "settings": asked.settings(rollout, state)}
+    watch = Watch(simulation, rollout, asked.record)
 
     def kept() -> str:
         there = folder.trajectory.exists()
         return f"the frames so far are in {folder.trajectory}; --resume goes on with them" if there else ""
 
     with locked(asked.out):
-        if asked.resume:
-            folder = RunFolder.resume(*given, **noted)
-        else:
-            folder = RunFolder.create(*given, overwrite=asked.overwrite, **noted)
+        folder = asked.folder(scene, simulation, "run", asked.settings(rollout, state))
         recording = RunRecording(simulation, rollout, folder, asked.frames, watch)
         begun = recording.go_on() if asked.resume else 0
         if asked.resume:

@@ -60,18 +60,15 @@ class Energy:
         ends = simulation.scene.container.extent()
         corners = np.zeros((1, simulation.dimension)) if ends is None else list(product(*zip(*ends, strict=True)))
         lowest = float((np.asarray(corners) @ gravity).max())
-        return cls(
-            kinetic=0.5 * float(masses @ (velocities**2).sum(axis=1)),
-            potential=float(masses @ (lowest - positions @ gravity)),
-        )
+        kinetic = 0.5 * float(masses @ (velocities**2).sum(axis=1))
+        return cls(kinetic, potential=float(masses @ (lowest - positions @ gravity)))
 
 
 class RunSummary:
     def __init__(
         self, simulation: Simulation, rollout: Rollout, last: State, seconds: float, readings: Mapping[str, Readings]
     ):
-        """Summarise a run, given its ``last`` state, the computing time ``seconds`` of this process, and the sensor
-        readings by name."""
+        """Summarise a run with its ``last`` state, computing time ``seconds`` of this process, and readings."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings
         self.computed = taken - rollout.progress.step  # without the steps of an earlier process
@@ -100,10 +97,6 @@ class RunSummary:
     def milliseconds(self) -> float:
         return 1e3 * self.seconds / max(self.computed, 1)
 
-    @property
-    def _computed_in_words(self) -> str:
-        return "all" if self.computed == self.steps else f"the last {self.computed}"
-
     def for_machines(self) -> dict[str, Any]:
         """Return the reproducible results of the run, by name."""
         least, greatest = self.densities or (None, None)
@@ -123,11 +116,12 @@ class RunSummary:
             for kind in ("kinetic", "potential", "total")
         ]
         densities = zip(("least", "greatest"), self.densities or (), strict=False)
+        computed = "all" if self.computed == self.steps else f"the last {self.computed}"
         return [
             ("steps", self.steps, ""),
             ("simulated time", f"{self.time:.4g}", "s"),
             ("time that a step took", f"{self.milliseconds:.3g}", "ms"),
-            (f"time that {self._computed_in_words} steps took", f"{self.seconds:.3g}", "s"),
+            (f"time that {computed} steps took", f"{self.seconds:.3g}", "s"),
             *energies,
             *((f"fluid at the start: {words}", "", "") for words in self.masses.off.values()),
             *([] if self.balance is None else self.balance.rows()),
@@ -143,13 +137,11 @@ class RunSummary:
 
     def __str__(self) -> str:
         last = self.last
-        last_ones = "" if self.computed == self.steps else f", {self._computed_in_words} of them"
+        last_ones = "" if self.computed == self.steps else f", the last {self.computed} of them"
         took = f"{last_ones} in {self.seconds:.3g} s, {self.milliseconds:.3g} ms a step"
-        text = (
-            f"{self.steps} steps of {self.sizes}{took if self.computed else ', which were there already'}; "
-            f"energy {last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
-            f"{self.first.total:.4g} J"
-        )
+        text = f"{self.steps} steps of {self.sizes}{took if self.computed else ', which were there already'}; energy "
+        text += f"{last.total:.4g} J (kinetic {last.kinetic:.3g}, potential {last.potential:.3g}), at the start "
+        text += f"{self.first.total:.4g} J"
         if self.turned:
             text += " in the gravity of that time"
         if self.densities is not None:
@@ -191,8 +183,7 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run. ``told`` is the section of results, and ``read`` has the sensor readings by name.
-    Shaded pictures are included if ``pictures`` is true."""
+    """Write the report of a run, with the results ``told``, the readings ``read`` by sensor, and shaded pictures."""
     scene, trajectory, step = simulation.scene, Trajectory.load(folder.trajectory), float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
     if scene.solver.chooses:
@@ -232,29 +223,22 @@ def _figures(simulation: Simulation, trajectory: Trajectory, folder: Path) -> Fi
     shown = sorted({0, len(trajectory) // 2, len(trajectory) - 1})
     frames, motions = [trajectory[k] for k in shown], SolidMotions.of(trajectory.others, scene.dimension)
     left = [np.ravel(frame.others.get("drained", none)) == 0.0 for frame in frames]
-    path = particles(
-        [frame.positions[here] for frame, here in zip(frames, left, strict=True)],
-        [f"t = {frame.time:.3f} s" for frame in frames],
-        folder / "particles.png",
-        colours=[np.linalg.norm(frame.velocities[here], axis=1) for frame, here in zip(frames, left, strict=True)],
-        colour_label="speed [m/s]",
-        container=scene.container.extent(),
-        lines=[solid_outline(posed(scene, motions, k)) for k in shown],
-    )
+    titles, pairs = [f"t = {frame.time:.3f} s" for frame in frames], list(zip(frames, left, strict=True))
+    speeds = [np.linalg.norm(frame.velocities[here], axis=1) for frame, here in pairs]
+    lines, sets = [solid_outline(posed(scene, motions, k)) for k in shown], [frame.positions[on] for frame, on in pairs]
+    look: Any = {"colours": speeds, "colour_label": "speed [m/s]", "lines": lines}
+    path = particles(sets, titles, folder / "particles.png", container=scene.container.extent(), **look)
     along = ", seen along the third axis" * (scene.dimension == 3)
     figures: Figures = [(f"The fluid at the start, half-way and at the end{along}.", path)]
-    return figures if scene.render is None else figures + _rendered(simulation, trajectory, shown, folder)
-
-
-def _rendered(simulation: Simulation, trajectory: Trajectory, shown: list[int], folder: Path) -> Figures:
+    if scene.render is None:
+        return figures
     renderer = simulation.renderer()
 
     def image(frame: int) -> np.ndarray:
         return renderer.render(trajectory[frame])
 
-    titles = [f"t = {trajectory.times[frame]:.3f} s" for frame in shown]
     path = images(map(image, shown), titles, folder / "rendered.png")
-    figures: Figures = [("The same, rendered.", path)]
+    figures.append(("The same, rendered.", path))
     if len(trajectory.times) > 1 and find_spec("av"):
         pace = Pace.of(trajectory.due, rate=common_rate([trajectory.marks]))
         path = write_video(folder / "run.mp4", map(image, pace.frames), pace.frames_per_second)
@@ -279,8 +263,7 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
 
 @dataclass(frozen=True)
 class Balance:
-    """Numbers of particles that entered and left the fluid. ``first`` + ``came`` equals ``last`` + the sum of
-    ``went``."""
+    """Numbers of particles that entered and left the fluid: ``first`` + ``came`` = ``last`` + the sum of ``went``."""
 
     first: int
     came: int
@@ -292,10 +275,8 @@ class Balance:
         """Count the particles, given `Frame.others` of the first and the last frame."""
         counts = {drain.name: count_name(drain.name) for drain in scene.drain}
         went = {name: int(np.ravel(last[key])[0] - np.ravel(first[key])[0]) for name, key in counts.items()}
-        inside, left = (
-            int(((np.ravel(at["drained"]) == 0.0) & ~waits(scene, at, np.size(at["drained"]))).sum())
-            for at in (first, last)
-        )
+        states = ((np.ravel(at["drained"]), at) for at in (first, last))
+        inside, left = (int(((drained == 0.0) & ~waits(scene, at, drained.size)).sum()) for drained, at in states)
         return cls(inside, left - inside + sum(went.values()), went, left)
 
     def for_machines(self) -> dict[str, Any]:

@@ -72,11 +72,10 @@ def sweep(
     frames.check()
     combinations, together = as_text(sets), as_text(zips)
     read_toml(file)
-    from cortado.cli.sweep import run_sweep
+    from cortado.cli.sweep import RunRequest, run_sweep
 
-    where = Where(scheduler, workers)
-    asked = (combinations, together, steps, time, out, device, precision, where, frames, pictures)
-    return partial(run_sweep, file, *asked)
+    asked = RunRequest(out, steps, time, device=device, precision=precision, report=pictures)
+    return partial(run_sweep, file, combinations, together, asked, frames, Where(scheduler, workers))
 
 
 def convergence(
@@ -182,9 +181,8 @@ def export(
     words = as_text(overrides)
     for word in words:
         if word.partition("=")[0].strip() not in ("picture.colour", "picture.surface"):
-            raise InputError(
-                f"--set is {word}, but must replace picture.colour or picture.surface: other keys only affect pictures."
-            )
+            wanted = "must replace picture.colour or picture.surface: other keys only affect pictures"
+            raise InputError(f"--set is {word}, but {wanted}.")
     from cortado.cli.existing_runs import export_run
 
     return partial(export_run, run, to, out, every, words)

@@ -6,6 +6,7 @@ Commands for existing runs and for many runs are in `cortado.cli.runs_and_sweeps
 import ast
 import textwrap
 import tomllib
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -136,9 +137,10 @@ def describe(
     frames.check()
     steps = steps_or_time(steps, time)
     words = text_overrides(scene, overrides)
-    from cortado.cli.describe import describe_scene
+    from cortado.cli.describe import RunRequest, describe_scene
 
-    return partial(describe_scene, scene, steps, time, frames.choice(), words, device, precision, picture, json)
+    asked = RunRequest(Path("runs/run"), steps, time, words, device, precision, frames.choice())
+    return partial(describe_scene, scene, asked, picture, json)
 
 
 @command(app)
@@ -211,10 +213,10 @@ def optimise(
     """
     require_one_of_both(resume, overwrite)
     words, told = text_overrides(task, overrides), command_line()
-    from cortado.cli.optimise import optimise_task
+    from cortado.cli.optimise import RunRequest, optimise_task
 
-    where = Where(scheduler, workers)
-    return partial(optimise_task, task, out, words, device, precision, resume, overwrite, told, where, pictures)
+    asked = RunRequest(out, None, None, words, device, precision, overwrite=overwrite, command=told)
+    return partial(optimise_task, task, replace(asked, resume=resume, pictures=pictures), Where(scheduler, workers))
 
 
 @command(app, answers=True)
@@ -235,9 +237,10 @@ def fit(
         overwrite: Replace an earlier run in the same folder.
     """
     words, told = text_overrides(task, overrides), command_line()
-    from cortado.cli.optimise import fit_task
+    from cortado.cli.optimise import RunRequest, fit_task
 
-    return partial(fit_task, task, out, words, device, precision, overwrite, told)
+    asked = RunRequest(out, None, None, words, device, precision, overwrite=overwrite, command=told)
+    return partial(fit_task, task, asked)
 
 
 for function in (picture, export, view, sweep):
@@ -307,8 +310,6 @@ def overview() -> str:
 
 SUMMARY = "A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples."
 CORTADO = Program("cortado", app, SUMMARY, overview)
-
-
 DAM = "dam"
 """Name of the template with a comment on every line."""
 TEMPLATES = Path(__file__).with_name("templates")

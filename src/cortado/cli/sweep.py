@@ -6,7 +6,7 @@ import json
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import product
 from math import prod
@@ -15,10 +15,10 @@ from typing import Any
 
 from cortado.arrays import check_steps
 from cortado.calls import counted
-from cortado.cli.arguments import ALL_FRAMES, HERE, FrameOptions, Where, require_shared, steps_or_time
+from cortado.cli.arguments import HERE, FrameOptions, Where, require_shared, steps_or_time
 from cortado.cli.existing_runs import SWEEP
 from cortado.cli.optimise import optimise_task, search_settings
-from cortado.cli.run import RunRequest, run_scene, run_settings
+from cortado.cli.run import RunRequest, run_scene
 from cortado.errors import ComputationError, CortadoError, CortadoWarning, InputError, shown, unwarned, warn
 from cortado.files.disk import locked, write_atomically
 from cortado.files.terminal import Interrupted, keeping, track, untracked
@@ -28,8 +28,6 @@ from cortado.scene.scene import load_scene, read_toml
 
 MOST_COMBINATIONS = 100_000
 _LONGEST_NAME = 120
-_PLAIN = re.compile(r"[A-Za-z0-9_=,.+-]+")
-"""Pattern of folder names that need no quotes in a shell."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +43,10 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """Name of the folder, made from the values. A long name, or a name with special characters, is shortened and
-        ends with a checksum."""
+        """Name of the folder, made of the values. A long or special one is shortened and ends with a checksum."""
         name = ",".join(self.overrides)
-        if _PLAIN.fullmatch(name) and len(name) <= _LONGEST_NAME and not name.startswith(("-", ".")):
+        is_plain = re.fullmatch(r"[A-Za-z0-9_=,.+-]+", name) and not name.startswith(("-", "."))  # needs no quotes
+        if is_plain and len(name) <= _LONGEST_NAME:
             return name
         plain = re.sub(r"[^A-Za-z0-9_=,.+-]+", "_", name).lstrip("-.")[:_LONGEST_NAME]
         return f"{plain}-{sha256(name.encode()).hexdigest()[:8]}"
@@ -101,23 +99,14 @@ def _split(text: str) -> list[str]:
     return parts
 
 
-MOST_NUMBERS = 12
-"""Greatest length of a list in the table."""
-
-
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the table of folders, values and results. ``results`` has the contents of result.json for each
-    combination's number."""
-    rows = [
-        {
-            "folder": combinations[number].name,
-            **dict(combinations[number].values),
-            "status": "failed" if result["failures"] else "done",
-            **_flat({name: value for name, value in result.items() if name != "failures"}),
-            "failures": " ".join(result["failures"]),
-        }
-        for number, result in sorted(results.items())
-    ]
+    """Write the table of folders, values and results, given the contents of result.json by combination number."""
+    rows = list[dict[str, Any]]()
+    for number, result in sorted(results.items()):
+        one, failures = combinations[number], result["failures"]
+        found = _flat({name: value for name, value in result.items() if name != "failures"})
+        found = {"status": "failed" if failures else "done", **found, "failures": " ".join(failures)}
+        rows.append({"folder": one.name, **dict(one.values), **found})
     columns = list(dict.fromkeys(column for row in rows for column in row if column != "failures")) + ["failures"]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
@@ -127,21 +116,16 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Flatten nested tables and join their names by full stops. Short lists become JSON, and long lists are
-    left out."""
+    """Flatten tables, with names joined by full stops. Short lists become JSON, and long lists are left out."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
             found |= _flat(value, f"{before}{name}.")
         elif not isinstance(value, list):
             found[f"{before}{name}"] = value
-        elif len(text := json.dumps(value)) and text.count(",") < MOST_NUMBERS:
+        elif len(text := json.dumps(value)) and text.count(",") < 12:
             found[f"{before}{name}"] = text
     return found
-
-
-SAME_TIME = 1e-9
-"""Relative difference below which two times count as equal."""
 
 
 @dataclass(frozen=True)
@@ -151,16 +135,14 @@ class Member:
     file: Path
     duration: float | None
     """Duration of a scene's run [s], or None for a task."""
-    out: Path
-    device: str
-    precision: str
+    asked: RunRequest
+    """What all runs have in common, with the folder of the sweep."""
     frames: FrameOptions
     """Choice of recorded frames. The default is about a hundred frames."""
-    report: bool
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
         """Return the contents of a combination's result.json. Missing results are computed first."""
-        require_shared(self.out, "the task and the folder of a sweep")
+        require_shared(self.asked.out, "the task and the folder of a sweep")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             found = self.finished(combination) or self._computed(combination)
@@ -175,18 +157,18 @@ class Member:
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)
-            scene, kind, settings = task.scene, "optimise", search_settings(task, self.precision)
+            scene, kind, settings = task.scene, "optimise", search_settings(task, self.asked.precision)
         else:
             scene, kind, steps = load_scene(self.file, overrides), "run", self.steps(combination)
-            settings = run_settings(steps, self.precision, self.frames.choice(max(steps // 100, 1)))
-        folder = self._folder(combination)
-        if folder is None:
+            frames = self.frames.choice(max(steps // 100, 1))
+            settings = {"steps": steps, "precision": self.asked.precision, **frames.settings}
+        if (folder := self._folder(combination)) is None:
             return None
         folder.require(scene.to_json(), kind, settings)
         return folder.read_result()
 
     def _folder(self, combination: Combination) -> RunFolder | None:
-        path = self.out / combination.name
+        path = self.asked.out / combination.name
         return RunFolder.open(path) if (path / "environment.json").exists() else None
 
     def steps(self, combination: Combination) -> int:
@@ -195,61 +177,44 @@ class Member:
         return check_steps(max(round(self.duration / _time_step(self.file, combination)), 1))
 
     def _computed(self, combination: Combination) -> dict[str, Any]:
-        out, overrides = self.out / combination.name, combination.overrides
-        begun = self._folder(combination) is not None
+        out, overrides, begun = self.asked.out / combination.name, combination.overrides, self._folder(combination)
         words = [str(self.file), *(word for one in overrides for word in ("--set", one)), "--out", str(out)]
-        words += ["--device", self.device, "--precision", self.precision]
+        words += ["--device", self.asked.device, "--precision", self.asked.precision]
+        asked = replace(self.asked, out=out, overrides=overrides, resume=begun is not None)
+        said = "It left no result."
         try:
             with untracked():
                 if self.duration is None:
-                    command = ["cortado", "optimise", *words]
-                    optimise_task(self.file, out, overrides, self.device, self.precision, begun, False, command)
+                    optimise_task(self.file, replace(asked, command=["cortado", "optimise", *words]))
                 else:
                     steps = self.steps(combination)
                     frames = self.frames.choice(max(steps // 100, 1))
                     ((name, value),) = frames.settings.items()
-                    command = ["cortado", "run", *words, "--steps", str(steps)]
-                    command += [f"--{name.replace('_', '-')}", str(value)]
-                    asked = steps, None, overrides, self.device, self.precision, frames
-                    asked_more: Any = {"resume": begun, "command": command, "report": self.report}
-                    run_scene(self.file, RunRequest(out, *asked, **asked_more))
+                    words += ["--steps", str(steps), f"--{name.replace('_', '-')}", str(value)]
+                    own: Any = {"steps": steps, "frames": frames, "command": ["cortado", "run", *words]}
+                    run_scene(self.file, replace(asked, **own))
         except Interrupted as stop:  # what is kept of one combination says less than the sweep does
             raise Interrupted(stop.args[0]) from None
         except CortadoError as error:
-            folder = self._folder(combination)
-            return (folder and folder.read_result()) or {"failures": [str(error)]}
+            said = str(error)
         folder = self._folder(combination)
-        assert folder is not None
-        return folder.read_result() or {"failures": ["It left no result."]}
+        return (folder and folder.read_result()) or {"failures": [said]}
 
 
 def run_sweep(
-    file: Path,
-    options: list[str],
-    zipped: list[str],
-    steps: int | None,
-    time: float | None,
-    out: Path,
-    device: str,
-    precision: str,
-    where: Where,
-    frames: FrameOptions = ALL_FRAMES,
-    pictures: bool = True,
+    file: Path, options: list[str], zipped: list[str], asked: RunRequest, frames: FrameOptions, where: Where
 ) -> str:
-    """Compute the missing combinations of a sweep and return a sentence that names the table. Raises `ComputationError`
-    if some combinations failed."""
-    chosen, duration = combinations(options, zipped), time
+    """Compute the missing combinations, and return a sentence on them. Raises `ComputationError` if some fail."""
+    chosen, duration, out = combinations(options, zipped), asked.time, asked.out.absolute()
     if "optimise" in read_toml(file):  # a task
-        for name, number in (("steps", steps), ("time", time)):
-            if number is not None:
-                raise InputError(f"--{name} is given, but must be left out, as the task says problem.steps.")
-        of_scenes = {"no-pictures": not pictures, "record-every": frames.record_every, "fps": frames.fps}
-        for name, value in of_scenes.items():
-            if value:
-                raise InputError(f"--{name} is given, but must be left out of a sweep of a task.")
-    elif (number := steps_or_time(steps, time)) is not None:
+        own: dict[str, Any] = {"steps": asked.steps, "time": asked.time, "no-pictures": None if asked.report else True}
+        for name, value in {**own, "record-every": frames.record_every, "fps": frames.fps}.items():
+            if value is not None:
+                why = ", as the task says problem.steps" if name in ("steps", "time") else " of a sweep of a task"
+                raise InputError(f"--{name} is given, but must be left out{why}.")
+    elif (number := steps_or_time(asked.steps, asked.time)) is not None:
         duration = check_steps(number) * min(_time_step(file, one) for one in chosen)
-    member = Member(file.absolute(), duration, out.absolute(), device, precision, frames, pictures)
+    member = Member(file.absolute(), duration, replace(asked, out=out, steps=None, time=None), frames)
     with unwarned():  # warnings are printed when a combination runs; mistakes are found before computing
         read = {number: member.finished(one) for number, one in enumerate(chosen)}
     done = {number: result for number, result in read.items() if result is not None}
@@ -257,28 +222,25 @@ def run_sweep(
     there = len(done)
 
     def kept() -> str:
-        return f"{len(done)} of {len(chosen)} are finished, in {out.absolute()}; the same command goes on with the rest"
-
-    def failed() -> list[int]:
-        return [number for number in sorted(done) if done[number]["failures"]]
+        return f"{len(done)} of {len(chosen)} are finished, in {out}; the same command goes on with the rest"
 
     def note(number: int, result: dict[str, Any]) -> None:
         done[left[number]] = result
         write_table(out, chosen, done)
-        advance(failed=len(failed()))
+        advance(failed=sum(bool(one["failures"]) for one in done.values()))
 
     with (
-        (where if left else HERE).executor(device, len(left)) as executor,
+        (where if left else HERE).executor(asked.device, len(left)) as executor,
         locked(out),
         keeping(kept),
         track(len(left), "sweep") as advance,
     ):
         write_table(out, chosen, done)
         executor.map(member, [chosen[number] for number in left], note)
-    failures = failed()
+    failures = [number for number in sorted(done) if done[number]["failures"]]
     _warn_of_times(member, [chosen[number] for number in done if number not in failures])
     all_of_them = f"Of {counted(len(chosen), 'combination')}{f', {there} of them there already,' if there else ''}"
-    table = f"table is {out.absolute() / SWEEP}, beside a folder for each."
+    table = f"table is {out / SWEEP}, beside a folder for each."
     if failures:
         first = f"the first of them {chosen[failures[0]].name}: {' '.join(done[failures[0]]['failures'])}"
         raise ComputationError(f"{all_of_them} {len(failures)} failed, {first} The {table}")
@@ -297,8 +259,7 @@ def _warn_of_times(member: Member, done: list[Combination]) -> None:
         return
     ends = {one.name: member.steps(one) * _time_step(member.file, one) for one in done}
     last, off = max(ends.items(), key=lambda pair: abs(pair[1] - duration))
-    if abs(off - duration) > SAME_TIME * duration:
-        warn(
-            f"not all combinations end at {duration:g} s, which is no whole number of their time steps: {last} "
-            f"ends at {off:g} s. Choose a --time that is a multiple of every time step."
-        )
+    if abs(off - duration) > 1e-9 * duration:
+        found = f"not all combinations end at {duration:g} s, which is no whole number of their time steps"
+        advice = "Choose a --time that is a multiple of every time step."
+        warn(f"{found}: {last} ends at {off:g} s. {advice}")

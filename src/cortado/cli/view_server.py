@@ -10,8 +10,8 @@ such as a message that opens a tunnel to the internet.
 
 import logging
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections.abc import Callable
+from contextlib import redirect_stdout, suppress
 from functools import partial
 from http import HTTPStatus
 from io import StringIO
@@ -38,15 +38,9 @@ HEADERS = {
 Answer = Callable[[ServerConnection, Request], Response | None]
 """Type of ``process_request`` in websockets. The function returns a page, or None to open a websocket."""
 LARGEST_NUMBER = 1e9
-LONGEST_MESSAGE = 2**16
-"""Greatest length of a message [bytes]."""
 Number = Annotated[float, msgspec.Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 Direction = tuple[Number, Number, Number]
 Controls = Callable[[str], Any]
-KNOWN = "1.1.1"
-"""The only supported version of viser."""
-FAREWELL = 0.3
-"""Waiting time for a page's answer when the window closes [s]."""
 _silent = logging.getLogger(__name__)
 """Logger that drops messages about failed connections."""
 _silent.disabled = True
@@ -88,12 +82,17 @@ class GuardedServer:
 
     def __init__(self, port: int, label: str):
         self._token, self._guarded = token_hex(16), False
-        with redirect_stdout(StringIO()), _serving(self._serve):  # it draws a box
-            self.viser: Any = viser.ViserServer(HOST, port, label, verbose=False)
+        usual = sockets.serve
+        sockets.serve = partial(self._serve, usual)  # type: ignore[misc, assignment]  # viser has no option for it
+        try:
+            with redirect_stdout(StringIO()):  # it draws a box
+                self.viser: Any = viser.ViserServer(HOST, port, label, verbose=False)
+        finally:
+            sockets.serve = usual  # type: ignore[misc]
         if not self._guarded:
             self.close()
             found = f"viser {viser.__version__} cannot be guarded by a token"
-            raise InputError(f"{found}, so that any web page could control the view: pip install viser=={KNOWN}.")
+            raise InputError(f"{found}, so that any web page could control the view: pip install viser==1.1.1.")
         self.viser.gui.configure_theme(show_share_button=False)
 
     @property
@@ -105,12 +104,17 @@ class GuardedServer:
             self.viser.stop()
 
     def _serve(self, serve: Callable[..., Any], *where: Any, process_request: Any = None, **options: Any) -> Any:
+        """Open a server by the function ``serve`` of websockets, with own checks."""
+
+        def control(name: str) -> Any:  # viser has no public way from the id in a message to its control
+            return self.viser.gui._gui_input_handle_from_uuid.get(name)
+
         self._guarded = True
         own = {
             "process_request": partial(self._answer, process_request),
-            "create_connection": partial(Hearing, controls=self._control),
-            "max_size": LONGEST_MESSAGE,
-            "close_timeout": FAREWELL,
+            "create_connection": partial(Hearing, controls=control),
+            "max_size": 2**16,  # bytes
+            "close_timeout": 0.3,  # seconds
             "logger": _silent,
         }
         return serve(*where, **options | own)
@@ -128,22 +132,6 @@ class GuardedServer:
         if response is not None:
             response.headers.update(HEADERS)
         return response
-
-    def _control(self, name: str) -> Any:
-        # viser has no public way from the id in a message to its control
-        return self.viser.gui._gui_input_handle_from_uuid.get(name)
-
-
-@contextmanager
-def _serving(serve: Callable[..., Any]) -> Iterator[None]:
-    """Replace the function that opens servers in websockets by ``serve``, because viser has no option for this. The
-    original function is the first argument of ``serve``."""
-    usual = sockets.serve
-    sockets.serve = partial(serve, usual)  # type: ignore[misc, assignment]
-    try:
-        yield
-    finally:
-        sockets.serve = usual  # type: ignore[misc]
 
 
 _decoder = msgspec.msgpack.Decoder(CameraMessage | Update)

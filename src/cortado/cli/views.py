@@ -26,7 +26,7 @@ from cortado.runs.frames import SolidMotions, posed, sized
 from cortado.runs.particle_sums import square
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.trajectory import Trajectory
-from cortado.scene.emitter_table import EmitterTable, path_name
+from cortado.scene.emitter_table import path_name
 from cortado.scene.restart import RestartState
 from cortado.scene.scene import Scene, load_scene
 from cortado.scene.stability import longest_step
@@ -34,16 +34,9 @@ from cortado.simulation import Simulation
 from cortado.solvers.particles import ParticleSolver
 
 UNITS = {"speed": "m/s", "density": "kg/m³", "pressure": "Pa", "vorticity": "1/s", "wall_force": "N"}
-RADIUS = 0.4
-"""Radius of a drawn particle [spacings]."""
-DISTANCE = 1.7
-"""Initial distance of the camera, relative to the radius of the displayed scene."""
 PALETTE = "viridis"
-BRIGHTEST = 99.5
-"""Percentile of the values at the upper end of the colour scale."""
 LINES = (130, 125, 118)
 THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
-
 Quantity = Callable[[], np.ndarray]
 """A function that computes a quantity (n,) of the particles. It may raise a `CortadoError`."""
 
@@ -60,8 +53,10 @@ class Window:
         except ModuleNotFoundError:
             raise InputError("viser, which shows the view, is not installed: pip install viser.") from None
         self.scene = scene
-        self._guarded = GuardedServer(port, f"Cortado: {scene.name}")
-        self.server: Any = self._guarded.viser
+        guarded = GuardedServer(port, f"Cortado: {scene.name}")
+        self.server: Any = guarded.viser
+        self.address, self.close = guarded.address, guarded.close
+        """Address for a browser, with the token that gives access, and the function that closes the window."""
         self._turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
         self._units = units
         self._cloud: Any = None
@@ -75,15 +70,16 @@ class Window:
         lines = self._space(container_outline(scene))
         if len(lines):
             self.server.scene.add_line_segments("/container", lines, LINES, **THIN)
-        self._solids = [self._draw_solid(f"/solid_{number}", one) for number, one in enumerate(shown_solids(scene))]
-
-    @property
-    def address(self) -> str:
-        """Address for a browser, with the token that gives access."""
-        return self._guarded.address
-
-    def close(self) -> None:
-        self._guarded.close()
+        self._solids = []
+        for number, one in enumerate(shown_solids(scene)):
+            name, pose = f"/solid_{number}", self._pose(one)
+            self._solids.append(self.server.scene.add_frame(name, show_axes=False, position=pose[0], wxyz=pose[1]))
+            self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(one))), LINES, **THIN)
+            if scene.dimension == 3 and not one.is_tank:
+                faces, colour = own_faces(one), tuple(to_srgb(one.colour[None, None])[0, 0].tolist())
+                look = {"color": colour, "opacity": 1.0 - one.transparency, "flat_shading": True}
+                mesh = in_space(np.float32(faces.vertices)), faces.corners
+                self.server.scene.add_mesh_simple(f"{name}/faces", *mesh, **look)
 
     def show(self, positions: Points, colours: Points, out: NDArray, quantities: Mapping[str, Quantity]) -> None:
         """Draw the particles that are marked in the mask ``out`` (n,), instead of the previous particles.
@@ -101,7 +97,7 @@ class Window:
     def place_solids(self, scene: Scene) -> None:
         with self.server.atomic():
             for frame, solid in zip(self._solids, shown_solids(scene), strict=False):
-                frame.position, frame.wxyz = self._space(solid.position), _quaternion(self._turn @ solid.turn)
+                frame.position, frame.wxyz = self._pose(solid)
 
     def refresh(self) -> None:
         if self._stale:
@@ -111,7 +107,7 @@ class Window:
         self._stale = False
         points, colours = self._points, self._colours()
         if self._cloud is None:
-            size = 2.0 * RADIUS * self.scene.discretisation.spacing
+            size = 0.8 * self.scene.discretisation.spacing
             style = {"point_size": size, "point_shape": "circle", "precision": "float32"}
             self._cloud = self.server.scene.add_point_cloud("/particles", points, colours, **style)
             return
@@ -131,7 +127,7 @@ class Window:
             words = escape(str(error))
             self.legend.content = f'<p style="padding: 0 .8em .4em; margin: 0; font-size: .85em">{words}</p>'
             return self._own_colours
-        least, greatest = float(values.min()), float(np.percentile(values, BRIGHTEST, method="higher"))
+        least, greatest = float(values.min()), float(np.percentile(values, 99.5, method="higher"))
         self.legend.content = _scale(name, self._units[name], least, greatest, clips=values.max() > greatest)
         share = np.clip((values - least) / (greatest - least or 1.0), 0.0, 1.0)
         return (255.0 * colormaps[PALETTE](share)[:, :3]).astype(np.uint8)
@@ -139,18 +135,12 @@ class Window:
     def _space(self, points: Points) -> np.ndarray:
         return np.asarray(in_space(np.asarray(points, np.float32) @ self._turn.T.astype(np.float32)))
 
-    def _draw_solid(self, name: str, solid: ShownSolid) -> Any:
-        """Draw the edges of a solid, and its faces in 3-D. Tanks have no faces. Returns viser's frame of the solid."""
-        pose = {"position": self._space(solid.position), "wxyz": _quaternion(self._turn @ solid.turn)}
-        frame = self.server.scene.add_frame(name, show_axes=False, **pose)
-        self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(solid))), LINES, **THIN)
-        if self.scene.dimension == 3 and not solid.is_tank:
-            faces, colour = own_faces(solid), tuple(to_srgb(solid.colour[None, None])[0, 0].tolist())
-            look = {"color": colour, "opacity": 1.0 - solid.transparency, "flat_shading": True}
-            self.server.scene.add_mesh_simple(
-                f"{name}/faces", in_space(np.float32(faces.vertices)), faces.corners, **look
-            )
-        return frame
+    def _pose(self, solid: ShownSolid) -> tuple[np.ndarray, np.ndarray]:
+        """Return the position of a solid (3,), and its rotation as a quaternion (w, x, y, z), (4,)."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_matrix(square(self._turn @ solid.turn)).as_quat()
+        return self._space(solid.position), np.roll(turn, 1)
 
     def look_at(self, positions: Points) -> None:
         """Point the camera at the container and the solids. Without them, point it at ``positions`` (n, d) [m]."""
@@ -161,14 +151,7 @@ class Window:
         away = np.array([0.4, 0.35, 1.0]) if self.scene.dimension == 3 else np.array([0.0, 0.0, 1.0])
         camera = self.server.initial_camera
         camera.look_at = middle
-        camera.position = middle + DISTANCE * radius * away / np.linalg.norm(away)
-
-
-def _quaternion(turn: Points) -> np.ndarray:
-    """Convert a rotation matrix (d, d) to a quaternion (w, x, y, z), (4,)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(square(turn)).as_quat(), 1)
+        camera.position = middle + 1.7 * radius * away / np.linalg.norm(away)
 
 
 def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> str:
@@ -204,23 +187,13 @@ def quantities_of(
 
 
 def own_fields(fields: Mapping[str, np.ndarray], particles: int) -> dict[str, Quantity]:
-    own = {name: array for name, array in fields.items() if name not in ADJOINT_FIELDS and array.ndim in (1, 2)}
-    return {name: partial(sizes_of, array) for name, array in own.items() if len(array) == particles}
+    shown = {name: a for name, a in fields.items() if a.ndim in (1, 2) and len(a) == particles}
+    return {name: partial(sizes_of, array) for name, array in shown.items() if name not in ADJOINT_FIELDS}
 
 
 def sizes_of(values: np.ndarray) -> np.ndarray:
     """Return numbers (n,) unchanged, or the lengths of vectors (n, k)."""
     return values if values.ndim == 1 else np.linalg.norm(values, axis=-1)
-
-
-STRIDE = 1.0 / 100.0
-"""Approximate simulated time between two pictures [s]."""
-SHORTEST_PAUSE = 1.0 / 40.0
-"""Shortest real time between two pictures [s]."""
-LEAN = 2.0
-"""Greatest gravity on the sliders, relative to the scene's gravity."""
-SHORTEST_PLAY = 4.0
-"""Least duration of the playback at normal pace [s]."""
 
 
 class RecordedView:
@@ -243,7 +216,7 @@ class RecordedView:
         passed, self._former = now - self._former, now
         last = len(self.trajectory) - 1
         if self.playing.value and last:
-            length = max(float(self.trajectory.times[-1] - self.trajectory.times[0]), SHORTEST_PLAY)
+            length = max(float(self.trajectory.times[-1] - self.trajectory.times[0]), 4.0)
             self._moment = (self._moment + passed * self.pace.value * last / length) % (last + 1)
             self.slider.value = min(int(self._moment), last)
         if self.slider.value != self._frame:
@@ -254,48 +227,52 @@ class RecordedView:
         time.sleep(1.0 / 30.0)
 
     def show(self, k: int) -> None:
-        frame, self._frame = self.trajectory[k], k
+        frame, self._frame, particles = self.trajectory[k], k, self.trajectory.particles
         self._time.content = f"t = {frame.time:.4g} s"
-        colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
+        colours = colours_of(self.scene, frame.mass_fractions, particles)
         quantities = quantities_of(frame.velocities, self._simulation, self.trajectory[: k + 1].last_state, {})
-        quantities |= own_fields(frame.others, self.trajectory.particles)
+        quantities |= own_fields(frame.others, particles)
         quantities |= {name: partial(sizes_of, values) for name, values in frame.quantities.items()}
         motions = SolidMotions.of(self.trajectory.others, self.scene.dimension)
         self.window.place_solids(posed(self.scene, motions, k))
-        out = is_out(self.scene, frame.others, self.trajectory.particles)
-        self.window.show(frame.positions, colours, out, quantities)
+        self.window.show(frame.positions, colours, is_out(self.scene, frame.others, particles), quantities)
 
 
 class LiveView:
     def __init__(self, simulation: Simulation, port: int):
         scene, self.simulation = simulation.scene, simulation
-        self.steps = max(round(STRIDE / longest_step(scene)), 1)
+        self.steps = max(round(0.01 / longest_step(scene)), 1)  # s of motion between pictures
         own = own_fields(simulation.initial.numpy(simulation.dimension), simulation.particles)
         units = {field.name: field.unit for field in simulation.initial.fields if field.name in own}
         self.window = Window(scene, port, {**UNITS, **units})
         gui = self.window.server.gui
         self.running = gui.add_checkbox("Run", True)
-        reset = gui.add_button("Begin again")
+        gui.add_button("Begin again").on_click(lambda _: setattr(self, "_wish_to_begin", True))
         self._told = gui.add_markdown("")
-        most = np.full(scene.dimension, LEAN * (float(np.linalg.norm(scene.forces.gravity)) or 9.81))
+        most = np.full(scene.dimension, 2.0 * (float(np.linalg.norm(scene.forces.gravity)) or 9.81))
         self.gravity = self._sliders("Gravity", "m/s²", scene.forces.gravity, (-most, most))
-        self.nozzles = {
-            emitter.name: self._sliders(emitter.name.capitalize(), "m", emitter.outlet, self._reach(emitter))
-            for emitter in scene.emitter
-        }
+        self.nozzles = dict[str, list[Any]]()
+        for emitter in scene.emitter:  # whose nozzle stays above the container
+            outlet, ends, half = np.array(emitter.outlet), scene.container.extent(), 0.5 * emitter.width
+            reach = outlet + np.array([[-20.0], [20.0]]) * half
+            if ends is not None:
+                inner = np.array([[1.0], [-1.0]]) * half + np.array(ends)
+                reach = np.stack([np.minimum(inner[0], outlet), np.maximum(inner[1], outlet)])
+                axis = int(np.abs(emitter.direction).argmax())
+                reach[:, axis] = outlet[axis] + np.array([-0.5, 0.5]) * half
+            self.nozzles[emitter.name] = self._sliders(emitter.name.capitalize(), "m", outlet, reach)
         self._wish_to_begin = False
-        reset.on_click(lambda _: setattr(self, "_wish_to_begin", True))
         self.window.look_at(simulation.positions)
         self._begin()
 
     def tick(self) -> None:
         if self._wish_to_begin:
             self._begin()
+        begun, pause = time.monotonic(), 1.0 / 40.0  # s from one picture to the next at least
         if not self.running.value:
             self.window.refresh()
-            time.sleep(SHORTEST_PAUSE)
+            time.sleep(pause)
             return
-        begun = time.monotonic()
         try:
             with unwarned():  # there would be one for each picture
                 found = self.simulation.run(self.steps, self._controls(), self.steps, self._state)
@@ -304,7 +281,7 @@ class LiveView:
             self._told.content = f"{error} Begin again."
             return
         self._show(found.last_state)
-        time.sleep(max(SHORTEST_PAUSE - (time.monotonic() - begun), 0.0))
+        time.sleep(max(pause - (time.monotonic() - begun), 0.0))
 
     def _begin(self) -> None:
         self._wish_to_begin = False
@@ -332,8 +309,7 @@ class LiveView:
         self.window.show(state["positions"], colours, is_out(scene, state.fields, particles), quantities)
 
     def _controls(self) -> dict[str, np.ndarray]:
-        """Return the controls of the next steps: gravity, and a straight path from each nozzle to its slider
-        position."""
+        """Return the controls of the next steps: gravity, and a straight path from each nozzle to its sliders."""
         controls = {"gravity": np.array([slider.value for slider in self.gravity])}
         share = np.arange(1, self.steps + 1)[:, None] / self.steps
         for name, sliders in self.nozzles.items():
@@ -349,17 +325,6 @@ class LiveView:
             step, label = float(f"{(greatest - least) / 200.0:.1g}"), f"{title} {axis} [{unit}]"
             found.append(self.window.server.gui.add_slider(label, least, greatest, step, float(value)))
         return found
-
-    def _reach(self, emitter: EmitterTable) -> np.ndarray:
-        """Return the range of a nozzle's sliders (2, d) [m], which is above the container."""
-        outlet, ends, half = np.array(emitter.outlet), self.simulation.scene.container.extent(), 0.5 * emitter.width
-        if ends is None:
-            return outlet + np.array([[-20.0], [20.0]]) * half
-        inner = np.array([[1.0], [-1.0]]) * half + np.array(ends)
-        reach = np.stack([np.minimum(inner[0], outlet), np.maximum(inner[1], outlet)])
-        axis = int(np.abs(emitter.direction).argmax())
-        reach[:, axis] = outlet[axis] + np.array([-0.5, 0.5]) * half
-        return reach
 
 
 def view(path: Path, overrides: list[str], device: str, precision: str | None, port: int) -> str:

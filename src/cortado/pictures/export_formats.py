@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,11 +44,16 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 def _write_series(run: Exported, folder: Path, advance: Advance, ending: str, text: Callable[[Any], Any]) -> list[str]:
-    """Write the files of all frames. ``text`` returns the contents of a file. Return the entries of a ParaView
-    collection."""
+    """Write the files of all frames, with the contents ``text``. Return the entries of a ParaView collection."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
-        for part, (of, (name, what)) in enumerate(_files(run, number, frame, ending).items()):
+        files: dict[str, Any] = {"particles": (_numbered("particles", number, ending), frame)}
+        if frame.surface is not None:
+            files["surface"] = _numbered("surface", number, ending), frame.surface
+        for solid in run.solids:
+            name = _numbered(solid.part, number, ending) if solid.moves else f"{solid.part}.{ending}"
+            files[solid.part] = name, frame.poses[solid.name].of(solid.mesh)
+        for part, (of, (name, what)) in enumerate(files.items()):
             if not (folder / name).exists():
                 write_atomically(folder / name, text(what))
             where = f'timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"'
@@ -62,23 +68,11 @@ def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) ->
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write a series of files with VTK, with all fields of the particles. Return ``run.pvd``, which lists the files and
-    their times."""
+    """Write VTK files with all fields of the particles. Return ``run.pvd``, which lists the files and their times."""
     entries = _write_series(run, folder, advance, "vtp", _vtp)
     lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries, "  </Collection>", "</VTKFile>"]
     write_atomically(folder / "run.pvd", "\n".join([*lines, ""]))
     return folder / "run.pvd"
-
-
-def _files(run: Exported, number: int, frame: ExportedFrame, ending: str) -> dict[str, tuple[str, Any]]:
-    """Return the names and contents of the files of a frame."""
-    found: dict[str, Any] = {"particles": (_numbered("particles", number, ending), frame)}
-    if frame.surface is not None:
-        found["surface"] = _numbered("surface", number, ending), frame.surface
-    for solid in run.solids:
-        name = _numbered(solid.part, number, ending) if solid.moves else f"{solid.part}.{ending}"
-        found[solid.part] = name, frame.poses[solid.name].of(solid.mesh)
-    return found
 
 
 def _numbered(name: str, number: int, ending: str) -> str:
@@ -118,10 +112,8 @@ def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
             stage.GetRootLayer().Save()
             temporary.replace(path)
         except pxr.Tf.ErrorException as problem:
-            raise ComputationError(
-                f"{path} cannot be written: USD reports {' '.join(str(problem).split())}; free some space, or choose "
-                "another place."
-            ) from problem
+            found, advice = " ".join(str(problem).split()), "free some space, or choose another place"
+            raise ComputationError(f"{path} cannot be written: USD reports {found}; {advice}.") from problem
         finally:
             temporary.unlink(missing_ok=True)
     return path
@@ -153,6 +145,8 @@ class _Writer:
             self._set_mesh(mesh, solid.mesh, pxr.Usd.TimeCode.Default())
 
     def add(self, code: float, frame: ExportedFrame) -> None:
+        from scipy.spatial.transform import Rotation
+
         if self._surface is not None:
             empty = np.zeros((0, 3))
             surface = frame.surface or Mesh(empty, empty, empty, empty, empty)
@@ -163,7 +157,10 @@ class _Writer:
         for solid in self._run.solids:
             if solid.moves or code == 0.0:
                 own = code if solid.moves else self._pxr.Usd.TimeCode.Default()
-                self._set_pose(solid.name, frame.poses[solid.name], own)
+                pose, (translate, orient), gf = frame.poses[solid.name], self._poses[solid.name], self._pxr.Gf
+                turn = Rotation.from_matrix(pose.turn).as_quat()
+                translate.Set(gf.Vec3d(*pose.position), own)
+                orient.Set(gf.Quatd(float(turn[3]), gf.Vec3d(*turn[:3])), own)
 
     def _field(self, name: str, values: np.ndarray) -> Any:
         kinds, geometry = self._pxr.Sdf.ValueTypeNames, self._pxr.UsdGeom
@@ -191,15 +188,6 @@ class _Writer:
         colour = prim.CreateDisplayColorPrimvar(self._pxr.UsdGeom.Tokens.vertex)
         colour.Set(self._floats(colours), code)
 
-    def _set_pose(self, name: str, pose: Pose, code: Any) -> None:
-        from scipy.spatial.transform import Rotation
-
-        turn = Rotation.from_matrix(pose.turn).as_quat()
-        translate, orient = self._poses[name]
-        gf = self._pxr.Gf
-        translate.Set(gf.Vec3d(*pose.position), code)
-        orient.Set(gf.Quatd(float(turn[3]), gf.Vec3d(*turn[:3])), code)
-
     def _floats(self, values: np.ndarray) -> Any:
         vt, own = self._pxr.Vt, np.ascontiguousarray(values, dtype=np.float32)
         kind = vt.FloatArray if own.ndim == 1 else {2: vt.Vec2fArray, 3: vt.Vec3fArray}[own.shape[1]]
@@ -208,16 +196,11 @@ class _Writer:
 
 def _pxr() -> Any:
     try:
-        import pxr
-        import pxr.Gf
-        import pxr.Sdf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.Vt
+        for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "Vt"):
+            import_module(f"pxr.{name}")
     except ImportError as error:
         raise ExtraMissingError("USD", "usd-core") from error
-    return pxr
+    return import_module("pxr")
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:
@@ -245,9 +228,8 @@ def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mappi
     data, places, topology = vtk.vtkPolyData(), vtk.vtkPoints(), vtk.vtkCellArray()
     places.SetData(_array("points", points))
     data.SetPoints(places)
-    starts = np.arange(0, corners.size + 1, corners.shape[1], dtype=np.int64)
-    flat = np.ascontiguousarray(corners.ravel(), dtype=np.int64)
-    topology.SetData(*(vtk.numpy_to_vtkIdTypeArray(one, deep=True) for one in (starts, flat)))
+    starts, flat = np.arange(0, corners.size + 1, corners.shape[1]), np.ascontiguousarray(corners.ravel())
+    topology.SetData(*(vtk.numpy_to_vtkIdTypeArray(one.astype(np.int64), deep=True) for one in (starts, flat)))
     getattr(data, f"Set{cells}")(topology)
     for name, values in fields.items():
         data.GetPointData().AddArray(_array(name, values))
@@ -292,10 +274,8 @@ def export(
     of, into = as_scene(scene), Path(as_path("folder", folder))
     phases = 1 if trajectory.mass_fractions is None else trajectory.mass_fractions.shape[-1]
     if of.dimension != trajectory.dimension or len(of.phase) != phases:
-        raise InputError(
-            f"scene has {of.dimension} dimensions and {len(of.phase)} phases, but must be that of the trajectory, with "
-            f"{trajectory.dimension} and {phases}."
-        )
+        wanted = f"that of the trajectory, with {trajectory.dimension} and {phases}"
+        raise InputError(f"scene has {of.dimension} dimensions and {len(of.phase)} phases, but must be {wanted}.")
     run = Exported(trajectory, of, simulation)
     with sentences(into):
         into.mkdir(parents=True, exist_ok=True)

@@ -22,7 +22,7 @@ from cortado.discretise.shapes import Points, in_space
 from cortado.errors import ComputationError
 from cortado.pictures.film import Computed, coloured_by, is_out, shown_places, those
 from cortado.pictures.painter import Scale, colours_of
-from cortado.pictures.shown_solids import ShownSolid, SolidMesh, shown_solids
+from cortado.pictures.shown_solids import Numbers, ShownSolid, SolidMesh, shown_solids
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.liquid_surface import Mesh, liquid_surface, nearest_colours, spheres
 from cortado.pictures.tracing.space import environment_of, particles_of, wetting
@@ -35,20 +35,8 @@ from cortado.scene.shape_tables import CylinderContainer
 
 EVEN = 1e-6
 """Relative tolerance for evenly spaced frames."""
-DIGITS = (0, 1, 2, 3)
-UNLIKE = 0.05
-"""Relative difference between the enclosed volume and the fluid's volume above which a message is printed."""
-ROUND = 0.05
-LINKED = 1.25
-"""Greatest distance of adjacent particles in a connected body of fluid [spacings]."""
-NEAR_SURFACE = 2.0
-"""Greatest distance from a surface for isolated particles that count towards its volume [spacings]."""
 MOST_SHIFT = 1.0
 """Greatest displacement of a surface point in one pass [spacings]."""
-PASSES = 2
-"""Number of passes that correct the enclosed volume."""
-ROUNDS = 20
-IN_PLACE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -70,7 +58,7 @@ class WholeFrames:
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
         """Choose frames for states recorded at ``times`` (m,) [s]. Frames are at the ``marks``, or at the states if the
-        states are evenly spaced. Otherwise a round frame rate is chosen."""
+        states are evenly spaced. Otherwise a round frame rate is chosen that gives each state a frame, or the mean."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -80,11 +68,15 @@ class WholeFrames:
         steps = np.diff(times)
         if not len(steps):
             return cls(24.0, times, np.zeros(1, dtype=np.intp), np.zeros(1), 0.0)
-        start, usual = float(times[0]), float(steps[0])
-        if (np.abs(steps[:-1] / usual - 1.0) < EVEN).all() and steps[-1] < usual * (1.0 + EVEN):
-            rate, count = 1.0 / usual, len(times) if steps[-1] > usual * (1.0 - EVEN) else len(times) - 1
+        start, step = float(times[0]), float(steps[0])
+        if (np.abs(steps[:-1] / step - 1.0) < EVEN).all() and steps[-1] < step * (1.0 + EVEN):
+            rate, count = 1.0 / step, len(times) if steps[-1] > step * (1.0 - EVEN) else len(times) - 1
             return cls(rate, times[:count], np.arange(count), np.zeros(count), float(times[-1] - times[count - 1]))
-        rate = _round_rate(times - start)
+        usual = times[:-1] - start
+        mean, numbers = (len(usual) - 1) / float(usual[-1]), np.arange(len(usual))
+        rates = (rate for rate in (round(mean, digits) for digits in range(4)) if rate > 0.0)
+        own = (rate for rate in rates if (np.abs(usual - numbers / rate) < 0.5 / rate).all())  # one for each state
+        rate = next(own, float(f"{mean:.3g}"))
         whole = start + np.arange(floor((times[-1] - start) * rate + EVEN) + 1) / rate
         after = np.clip(np.searchsorted(times, whole), 1, len(times) - 1)  # the nearest one is this or that before
         recorded = np.where(whole - times[after - 1] <= times[after] - whole, after - 1, after)
@@ -100,17 +92,6 @@ class WholeFrames:
         if self.left_out > EVEN / self.rate:
             found.append(f"the last state, {1e3 * self.left_out:.3g} ms after the last whole frame, is left out")
         return "; ".join(found)
-
-
-def _round_rate(times: NDArray[np.float64]) -> float:
-    """Return a round frame rate [1/s] that gives each recorded state a separate frame, or the mean rate."""
-    usual = times[:-1]
-    mean = (len(usual) - 1) / float(usual[-1])
-    for digits in DIGITS:
-        rate = round(mean, digits)
-        if rate > 0.0 and (np.abs(usual - np.arange(len(usual)) / rate) < 0.5 / rate).all():
-            return rate
-    return float(f"{mean:.3g}")
 
 
 @dataclass(frozen=True)
@@ -170,9 +151,11 @@ class Exported:
             part = f"{part}_{number}" if part in {solid.part for solid in self.solids} else part
             self.solids.append(_solid(one, part, name in trajectory.solids))
         self._trajectory = trajectory
+        self.up = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(3)
+        """Rotation (3, 3) of the upward direction of the scene, against gravity, to the y axis."""
+        self.spacing = scene.discretisation.spacing
         self._held = (0.0, 0.0, 1.0, 1.0)
-        """Greatest relative difference of the volumes so far, its time [s], and the volumes of surface and
-        fluid [m³]."""
+        """Greatest relative difference of volumes so far, its time [s], and the volumes of surface and fluid [m³]."""
 
     @cached_property
     def whole(self) -> WholeFrames:
@@ -182,16 +165,6 @@ class Exported:
     def series(self) -> WholeFrames | None:
         """Frames of a series of files, or None if all recorded states are written."""
         return None if self._trajectory.marks is None else self.whole
-
-    @property
-    def spacing(self) -> float:
-        return self.scene.discretisation.spacing
-
-    @property
-    def up(self) -> Points:
-        """Rotation (3, 3) that turns the upward direction of the scene, against gravity, to the y axis. It is the
-        identity in 2-D."""
-        return upright(np.asarray(self.scene.forces.gravity)) if self.scene.dimension == 3 else np.eye(3)
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
         """Yield all recorded states or the ``whole`` frames, one at a time to save memory."""
@@ -203,10 +176,9 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """Describe the difference between the volumes of exported surfaces and of the fluid. A small difference gives
-        an empty text."""
+        """Describe the difference between the volumes of surface and fluid, or return an empty text for a small one."""
         unlike, time, held, whole = self._held
-        if unlike <= UNLIKE:
+        if unlike <= 0.05:
             return ""
         return f"at {time:.4g} s the surface encloses {held:.4g} m³, where there are {whole:.4g} m³ of fluid"
 
@@ -249,27 +221,22 @@ def _first_of_each(scene: Scene) -> dict[str, ShownSolid]:
 
 def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
     size = float(np.ptp(shown.shape.extent(), axis=0).max())
-    faces = shown.shape.shown_faces(ROUND * size)
+    faces = shown.shape.shown_faces(0.05 * size)
     faces = faces.reversed() if shown.is_tank else faces
-    if len(shown.turn) == 2:
-        points, triangles, normals = _ribbon(faces.vertices, faces.corners, size)
+    if len(shown.turn) == 2:  # an outline, which becomes a ribbon a tenth of its size wide
+        start, end = (faces.vertices[edge] for edge in faces.corners.T)
+        along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
+        outwards = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
+        height = np.array([-0.05, 0.05]) * size
+        ends = np.stack([start, end, end, start], axis=1)
+        points = np.concatenate([ends, np.broadcast_to(height[[0, 0, 1, 1], None], (len(ends), 4, 1))], axis=2)
+        triangles = 4 * np.arange(len(ends))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+        points, triangles, normals = points.reshape(-1, 3), triangles.reshape(-1, 3), np.repeat(outwards, 4, axis=0)
     else:
         found = SolidMesh.of(faces, np.inf)
         points, triangles, normals = found.points, found.triangles, found.normals
     colours = np.tile(shown.colour, (len(points), 1))
     return ExportedSolid(shown.name, part, Mesh(points, triangles, normals, colours), moves)
-
-
-def _ribbon(vertices: Points, edges: np.ndarray, size: float) -> tuple[Points, np.ndarray, Points]:
-    """Extrude a 2-D outline perpendicular to the plane by a tenth of its size. Return points, triangles and normals."""
-    start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
-    along = (end - start) / np.linalg.norm(end - start, axis=1)[:, None]
-    outwards = np.stack([along[:, 1], -along[:, 0], np.zeros(len(along))], axis=1)
-    height = np.array([-0.05, 0.05]) * size
-    ends = np.stack([start, end, end, start], axis=1)
-    points = np.concatenate([ends, np.broadcast_to(height[[0, 0, 1, 1], None], (len(ends), 4, 1))], axis=2)
-    corners = 4 * np.arange(len(ends))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
-    return points.reshape(-1, 3), corners.reshape(-1, 3), np.repeat(outwards, 4, axis=0)
 
 
 def enclosed(points: Points, triangles: np.ndarray) -> float:
@@ -278,11 +245,8 @@ def enclosed(points: Points, triangles: np.ndarray) -> float:
     return float(_sixth(a, b, c).sum())
 
 
-Kept = Callable[[Points], Points]
-
-
 def with_volume(
-    points: Points, triangles: np.ndarray, ways: Points, places: Points, spacing: float, kept: Kept
+    points: Points, triangles: Numbers, ways: Points, places: Points, spacing: float, kept: Callable[[Points], Points]
 ) -> Points:
     """Move the points (p, 3) [m] of a surface so that it encloses the volume of its particles, ``spacing``³ each.
 
@@ -292,11 +256,20 @@ def with_volume(
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
-    most = MOST_SHIFT * spacing
-    for _ in range(PASSES):
-        volumes, shift = _volumes(points - points[0], ways, triangles, of_points, count), np.zeros(count)
-        for _ in range(ROUNDS):
-            volume, slope = volumes(shift)
+    most, own = MOST_SHIFT * spacing, of_points[triangles[:, 0]]
+    for _ in range(2):  # as walls stop some points
+        shift = np.zeros(count)
+        (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points - points[0], ways))
+        terms = (
+            _sixth(a, b, c),
+            _sixth(x, b, c) + _sixth(a, y, c) + _sixth(a, b, z),
+            _sixth(x, y, c) + _sixth(x, b, z) + _sixth(a, y, z),
+            _sixth(x, y, z),
+        )
+        c0, c1, c2, c3 = (np.bincount(own, term, count) for term in terms)
+        for _ in range(20):  # Newton's method for the volume, a polynomial of the shift
+            volume = c0 + shift * (c1 + shift * (c2 + shift * c3))
+            slope = c1 + shift * (2.0 * c2 + 3.0 * shift * c3)
             step = np.divide(wanted - volume, slope, out=np.zeros(count), where=slope > 0.0)
             shift = np.clip(shift + np.clip(step, -0.2 * spacing, 0.2 * spacing), -most, most)
         points = kept(points + shift[of_points][:, None] * ways)
@@ -304,8 +277,7 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number the connected bodies of fluid. Return the body's number for each surface point (p,) and for each particle
-    (n,), or -1."""
+    """Number the connected bodies of fluid. Return the numbers of surface points (p,) and of particles (n,), or -1."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -317,32 +289,15 @@ def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: floa
     sheets = parts(len(points), triangles[:, :2].T.ravel(), triangles[:, 1:].T.ravel())
     tree, n = cKDTree(places), len(places)
     near = tree.query(points, workers=usable_cores())[1]
-    pairs = tree.query_pairs(LINKED * spacing, output_type="ndarray")
+    pairs = tree.query_pairs(1.25 * spacing, output_type="ndarray")
     first, second = np.append(pairs[:, 0], near), np.append(pairs[:, 1], n + sheets)
     found = parts(n + sheets.max() + 1, first, second)
     of_points, of_particles = found[n + sheets], found[:n]
     alone = np.flatnonzero(~np.isin(of_particles, of_points))
     if len(alone):
         distances, nearest = cKDTree(points).query(places[alone], workers=usable_cores())
-        of_particles[alone] = np.where(distances < NEAR_SURFACE * spacing, of_points[nearest], -1)
+        of_particles[alone] = np.where(distances < 2.0 * spacing, of_points[nearest], -1)
     return of_points, of_particles
-
-
-def _volumes(
-    points: Points, ways: Points, triangles: np.ndarray, bodies: np.ndarray, count: int
-) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return a function that maps displacements of surfaces (bodies,) [m] to enclosed volumes (bodies,) [m³] and their
-    derivatives [m²]."""
-    (a, b, c), (x, y, z) = ([each[corner] for corner in triangles.T] for each in (points, ways))
-    own = bodies[triangles[:, 0]]
-    terms = (
-        _sixth(a, b, c),
-        _sixth(x, b, c) + _sixth(a, y, c) + _sixth(a, b, z),
-        _sixth(x, y, c) + _sixth(x, b, z) + _sixth(a, y, z),
-        _sixth(x, y, z),
-    )
-    c0, c1, c2, c3 = (np.bincount(own, term, count) for term in terms)
-    return lambda d: (c0 + d * (c1 + d * (c2 + d * c3)), c1 + d * (2.0 * c2 + 3.0 * d * c3))
 
 
 def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
@@ -363,7 +318,7 @@ def contained_liquid(stage: Stage, positions: Points, colours: Points, device: A
         triangles, colours = found.triangles.numpy().reshape(-1, 3), found.colours.numpy()
     kept = _in_room(stage, points)
     beyond = np.linalg.norm(points - kept, axis=1)
-    is_free = beyond <= IN_PLACE * stage.spacing
+    is_free = beyond <= 1e-6 * stage.spacing
     normals[~is_free] = (points - kept)[~is_free] / beyond[~is_free, None]
     ways, in_room = np.where(is_free[:, None], normals, 0.0), partial(_in_room, stage)
     points = with_volume(kept, triangles, ways, places, stage.spacing, in_room)

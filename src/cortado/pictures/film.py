@@ -44,15 +44,9 @@ ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
 """A function that draws frame number k as a linear picture (rows, columns, 3) from 0 to 1. Its second argument is the
 frames before and after k."""
-
-
-MOST_PICTURES = 9
 LEAST_PIXELS = 64
-AIR = 1.25
-"""Greatest height of a picture, relative to the height of its contents at full width."""
 SLOW = 0.1
 """Speed of a film below which fluid at rest is not averaged over frames [simulated seconds per second]."""
-TELLING_FRAMES = 100
 
 
 @dataclass(frozen=True)
@@ -110,7 +104,7 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
     shown = stages[0].framed(ends, page).seen_size
     across = in_a_row(count, shown, page)
     width, height = page.width // across, page.height // -(-count // across)
-    size = {"width": width, "height": min(height, round(AIR * width * shown[1] / shown[0]))}
+    size = {"width": width, "height": min(height, round(1.25 * width * shown[1] / shown[0]))}
     if min(size.values()) < LEAST_PIXELS:
         found = f"{count} pictures of {size['width']} x {size['height']} pixels fit into {page.width} x {page.height}"
         least = f"{LEAST_PIXELS} x {LEAST_PIXELS}"
@@ -119,8 +113,7 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """Choose how many of ``count`` pictures to place in a row, so that the contents are large. ``size`` (2,) is the
-    width and height of the contents."""
+    """Choose how many of ``count`` pictures are in a row, so that contents of width and height ``size`` are large."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -179,7 +172,7 @@ class ShownRun:
     @cached_property
     def stage(self) -> PlaneStage | Stage:
         count, scene = len(self.trajectory), sized(self.scene, self._motions)
-        frames = range(0, count, max(count // TELLING_FRAMES, 1)) if self._motions else ()
+        frames = range(0, count, max(count // 100, 1)) if self._motions else ()
         poses = [posed(self.scene, self._motions, k) for k in frames]
         return stage_of(scene, shown_places(self.scene, self.trajectory), poses)
 

@@ -26,22 +26,16 @@ Resolution = int | tuple[int, int]
 Colour = tuple[float, float, float]
 Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.bool_]]
 """A function that tests whether points x, y are inside a shape. The shape extends from y = -1 to y = 1."""
-
 MILK: Colour = (0.96, 0.93, 0.86)
 COFFEE: Colour = (0.30, 0.16, 0.08)
 WHITE: Colour = (1.0, 1.0, 1.0)
-DRAWN = 100.0
-"""Memory for drawing [bytes per pixel]."""
-SAMPLES = 6
-"""Number of sample points along the side of a pixel."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 MOST_BYTES = 2**28
 """Greatest size of a picture file [bytes]."""
 MOST_PIXELS = 2**26
-MOST_PIXELS_KEPT = 2**24
 PIXELS_AT_ONCE = 2**20
-ROUNDING = 0.01
 LIGHT = from_srgb(np.arange(256, dtype=np.uint8))
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 
 
 @public
@@ -101,7 +95,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
     Example: ``target = cortado.pictures.read_picture("target.png", (64, 48))  # (48, 64, 3)``
     """
     shape = None if resolution is None else _columns_and_rows(resolution)
-    picture = open_picture(path, MOST_PIXELS_KEPT if resolution is None else MOST_PIXELS)
+    picture = open_picture(path, 2**24 if resolution is None else MOST_PIXELS)
     if shape is None:
         return _whole(picture)
     warn_of_cropping(f"The picture {path} has", picture.size, shape)
@@ -109,9 +103,19 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 
 def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
-    """Resample the largest central part of a Pillow picture that has the aspect ratio of ``resolution``, in linear
-    light."""
-    return _whole(picture) if resolution == picture.size else _resampled(picture, *resolution)
+    """Resample the largest central part of a Pillow picture with the ratio of ``resolution``, in linear light."""
+    from PIL import Image
+
+    if resolution == picture.size:
+        return _whole(picture)
+    box = _middle(picture.size, resolution)
+    small, light = np.empty((*resolution[::-1], 3)), LIGHT.astype(np.float32)
+    for k in range(3):
+        channel = Image.new("F", picture.size)
+        for first, band in _bands(picture):
+            channel.paste(Image.fromarray(light[np.asarray(band.getchannel(k))]), (0, first))
+        small[..., k] = np.asarray(channel.resize(resolution, Image.Resampling.BILINEAR, box=box))
+    return small
 
 
 def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
@@ -141,11 +145,10 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Warn if a picture of ``size`` pixels must be cropped to the aspect ratio of ``shape``. The message begins with
-    ``found``."""
+    """Warn, with a sentence that begins with ``found``, if ``size`` must be cropped to the ratio of ``shape``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
-    if share < 1.0 - ROUNDING:
+    if share < 0.99:
         found = f"{found} {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
         warn(f"{found}: only the middle is taken, {share:.0%} of it.")
 
@@ -182,30 +185,28 @@ def _drawn(shape: Shape, resolution: Resolution, cup: float | None, size: float,
     for name, value in (("cup", 1.0 if cup is None else cup), ("size", size)):
         positive(name, value)
     columns, rows = _columns_and_rows(resolution)
-    require({"a picture": DRAWN * columns * rows}, "take a smaller resolution")
+    require({"a picture": 100.0 * columns * rows}, "take a smaller resolution")  # bytes
     milk, coffee, background = (np.array(vector("A colour", colour)) for colour in colours)
     scale = size * (1.0 if cup is None else cup)
-    picture = _mixed(_coverage(lambda x, y: shape(x / scale, y / scale), columns, rows), milk, coffee)
-    if cup is None:
-        return picture
-    return _mixed(_coverage(lambda x, y: x**2 + y**2 < cup**2, columns, rows), picture, background)
-
-
-def _mixed(share: Picture, inside: Picture, outside: Picture) -> Picture:
-    return share * inside + (1.0 - share) * outside
+    share = _coverage(lambda x, y: shape(x / scale, y / scale), columns, rows)
+    picture: Picture = share * milk + (1.0 - share) * coffee
+    if cup is not None:
+        share = _coverage(lambda x, y: x**2 + y**2 < cup**2, columns, rows)
+        picture = share * picture + (1.0 - share) * background
+    return picture
 
 
 def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
     """Return the fraction of each pixel inside a shape (rows, columns, 1)."""
-    half = 0.5 * min(columns, rows)
+    half, samples = 0.5 * min(columns, rows), 6  # along the side of a pixel
     covered = np.zeros((rows, columns, 1))
-    offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    offsets = (np.arange(samples) + 0.5) / samples
     for down in offsets:
         y = (0.5 * rows - np.arange(rows) - down)[:, None] / half
         for right in offsets:
             x = (np.arange(columns) + right - 0.5 * columns)[None, :] / half
             covered[..., 0] += shape(x, y)
-    return covered / SAMPLES**2
+    return covered / samples**2
 
 
 def _in_heart(x: Any, y: Any) -> Any:
@@ -250,24 +251,6 @@ def _whole(picture: Any) -> Picture:
     return linear
 
 
-def _resampled(picture: Any, columns: int, rows: int) -> Picture:
-    from PIL import Image
-
-    box = _middle(picture.size, (columns, rows))
-    small, light = np.empty((rows, columns, 3)), LIGHT.astype(np.float32)
-    for k in range(3):
-        channel = Image.new("F", picture.size)
-        for first, band in _bands(picture):
-            channel.paste(Image.fromarray(light[np.asarray(band.getchannel(k))]), (0, first))
-        small[..., k] = np.asarray(channel.resize((columns, rows), Image.Resampling.BILINEAR, box=box))
-    return small
-
-
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-MOST_BYTES_OF_VIDEO = 2**33
-"""Greatest size of a video file [bytes]."""
-
-
 def read_frames(
     path: str | Path,
     resolution: tuple[int, int],
@@ -298,12 +281,17 @@ def read_frames(
     else:
         pictures = _decoded(path)
     for number, (time, picture) in enumerate(pictures):
-        if number % every == 0:
-            cropped = _cropped(path, picture, crop)
-            if not frames:
-                warn_of_cropping(f"The frames of {path} have", cropped.size, resolution)
-            times.append(time if frame_rate is None else number / frame_rate)
-            frames.append(resized(cropped, resolution))
+        if number % every:
+            continue
+        left, top, right, bottom = crop or (0, 0, *picture.size)
+        if not (0 <= left < right <= picture.width and 0 <= top < bottom <= picture.height):
+            wanted = f"lie within the frames of {path}, which have {picture.width} x {picture.height} pixels"
+            raise InputError(f"crop is {[left, top, right, bottom]}, but must {wanted}.")
+        cropped = picture.crop((left, top, right, bottom)) if crop else picture
+        if not frames:
+            warn_of_cropping(f"The frames of {path} have", cropped.size, resolution)
+        times.append(time if frame_rate is None else number / frame_rate)
+        frames.append(resized(cropped, resolution))
     if not frames:
         raise InputError(f"{path} has no frames; pictures in a folder must end in {', '.join(ENDINGS)}.")
     return np.array(times) - times[0], np.stack(frames)
@@ -312,7 +300,7 @@ def read_frames(
 def _decoded(path: str | Path) -> Iterator[tuple[float, Any]]:
     av = pyav()
     try:
-        regular_file(path, MOST_BYTES_OF_VIDEO)
+        regular_file(path, 2**33)
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
                 yield float(frame.time or 0.0), _upright(frame)
@@ -334,13 +322,3 @@ def _upright(frame: Any) -> Any:
         picture, a, d = picture.transpose(Transpose.TRANSPOSE), c, b
     picture = picture.transpose(Transpose.FLIP_LEFT_RIGHT) if a < 0 else picture
     return picture.transpose(Transpose.FLIP_TOP_BOTTOM) if d < 0 else picture
-
-
-def _cropped(path: str | Path, picture: Any, crop: tuple[int, ...] | None) -> Any:
-    if crop is None:
-        return picture
-    left, top, right, bottom = crop
-    if not (0 <= left < right <= picture.width and 0 <= top < bottom <= picture.height):
-        size = f"{picture.width} x {picture.height}"
-        raise InputError(f"crop is {list(crop)}, but must lie within the frames of {path}, which have {size} pixels.")
-    return picture.crop(crop)

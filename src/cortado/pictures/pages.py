@@ -42,7 +42,8 @@ _KINDS = {
 }
 WIDE = ' style="width: 100%"'
 AGAIN, LATER = "<h2>How to run it again</h2>", "<h2>Drawn later</h2>"
-MOST_WRITTEN_OUT = 12
+MOST_NUMBERS = 6
+"""Greatest number of values of a parameter in the table. For larger parameters the table shows the range."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,13 @@ class Section:
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
     """Write the report of a run and return its path. The page ends with the run's command, scene and environment.
     Raises `InputError` for a picture that cannot be embedded or a page that cannot be written."""
+    again = "<p>The command is not known.</p>"
+    with suppress(OSError, ValueError, KeyError):
+        noted = json.loads(folder.environment.read_text(encoding="utf-8"))
+        commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
+        lines, place = escape("\n".join(map(shlex.join, commands))), escape(str(folder.path))
+        again = f"<pre>{lines}</pre>\n<p>With --overwrite it takes the place of this run. The folder of the run is "
+        again += f"{place}; scene.json in it is the scene with everything that was replaced.</p>"
     parts = "\n".join(_section(section) for section in sections)
     player = script() if any(section.view for section in sections) else ""
     look = f"{Path(__file__).with_name('report.css').read_text(encoding='utf-8')}\n{style()}"
@@ -79,7 +87,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 <h1>{escape(title)}</h1>
 {parts}
 {AGAIN}
-{_again(folder)}
+{again}
 {_details("Scene", folder.scene)}
 {_details("Where it ran", folder.environment)}
 {player}
@@ -108,7 +116,7 @@ def written(value: Any) -> str:
         return str(value)
     if array.ndim == 0:
         return _number(value)
-    if array.size > MOST_WRITTEN_OUT:
+    if array.size > 12:
         shape = " × ".join(map(str, array.shape))
         return f"{shape} numbers from {_number(np.nanmin(array))} to {_number(np.nanmax(array))}, in result.json"
     rows = array.reshape(-1, array.shape[-1]) if array.size else array.reshape(0, 1)
@@ -126,14 +134,12 @@ def _section(section: Section) -> str:
     parts += [section.view] if section.view else []
     if section.rows:
         head = "".join(f'<th scope="col">{escape(word)}</th>' for word in section.head)
-        rows = [f'<tr><th scope="row">{escape(str(first))}</th>{_cells(rest)}</tr>' for first, *rest in section.rows]
-        lines = [f"<tr>{head}</tr>" if head else "", *rows]
-        parts.append("\n".join(['<div class="wide"><table>', *lines, "</table></div>"]))
+        lines = ['<div class="wide"><table>', f"<tr>{head}</tr>" if head else ""]
+        for first, *rest in section.rows:
+            cells = "".join(f"<td>{escape(written(entry))}</td>" for entry in rest)
+            lines.append(f'<tr><th scope="row">{escape(str(first))}</th>{cells}</tr>')
+        parts.append("\n".join([*lines, "</table></div>"]))
     return "\n".join([f"<h2>{escape(section.title)}</h2>", *parts]) if parts else ""
-
-
-def _cells(entries: Sequence[object]) -> str:
-    return "".join(f"<td>{escape(written(entry))}</td>" for entry in entries)
 
 
 def _figure(caption: str, path: Path) -> str:
@@ -154,19 +160,6 @@ def _shown(path: Path, words: str, look: str = "") -> str:
     return f'<img alt="{escape(words)}" {source}>'
 
 
-def _again(folder: RunFolder) -> str:
-    try:
-        noted = json.loads(folder.environment.read_text(encoding="utf-8"))
-        commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
-    except (OSError, ValueError, KeyError):
-        return "<p>The command is not known.</p>"
-    lines = "\n".join(shlex.join(command) for command in commands)
-    return (
-        f"<pre>{escape(lines)}</pre>\n<p>With --overwrite it takes the place of this run. The folder of the run is "
-        f"{escape(str(folder.path))}; scene.json in it is the scene with everything that was replaced.</p>"
-    )
-
-
 def _details(label: str, path: Path) -> str:
     if not path.exists():
         return ""
@@ -176,13 +169,6 @@ def _details(label: str, path: Path) -> str:
     return f"<details><summary>{escape(label)}</summary><pre>{escape(text)}</pre></details>"
 
 
-IN_MOTION = 1_000_000
-"""Greatest size of an animation in a notebook [bytes]."""
-MOST_NUMBERS = 6
-"""Greatest number of values of a parameter in the table. For larger parameters the table shows the range."""
-HEAD = ("parameter", "unit", "first guess", "found")
-
-
 def simulation_page(simulation: Simulation) -> str:
     first, scene = simulation.positions[: simulation.free_particles or None], simulation.scene
     look: Any = {"container": scene.container.extent(), "lines": [solid_outline(scene)]}
@@ -190,8 +176,7 @@ def simulation_page(simulation: Simulation) -> str:
 
 
 def trajectory_page(run: Trajectory) -> str:
-    """Return HTML of a trajectory: its repr, an animation with y up, and pictures of the first, middle and last frame,
-    coloured by speed."""
+    """Return HTML of a trajectory: its repr, an animation, and pictures of 3 frames, coloured by speed."""
     if not len(run):
         return f"<pre>{escape(repr(run))}</pre>"
     domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)
@@ -199,7 +184,7 @@ def trajectory_page(run: Trajectory) -> str:
     titles = [f"t = {frame.time:.4g} s" for frame in shown]
     speeds = [np.linalg.norm(frame.velocities, axis=1) for frame in shown]
     sets, label = [domain.wrapped(frame.positions) for frame in shown], "speed [m/s]"
-    chosen, stride = thinned(len(run), run.particles, 2 * run.dimension + 1, IN_MOTION)
+    chosen, stride = thinned(len(run), run.particles, 2 * run.dimension + 1, 1_000_000)  # bytes
     thin = [array[chosen, ::stride] for array in (run.positions, run.velocities)]
     cloud = Cloud("run", domain.wrapped(thin[0]), np.linalg.norm(thin[1], axis=2))
     view = particle_view([cloud], run.times[chosen], spacing_of(run.positions[0], 1.0), stride=stride)
@@ -214,16 +199,14 @@ def film_page(film: Film) -> str:
 
 
 def result_page(found: object, message: str, problem: Any, start: Values, best: Values, losses: Any) -> str:
-    """Return HTML of the result of a search. For a `Problem` it includes pictures of the runs with the first and with
-    the best parameters."""
+    """Return HTML of the result of a search. For a `Problem`, it shows the runs with the first and best parameters."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
-    rows = [
-        (name.replace("_", " "), (is_ours and UNITS.get(name, "")) or "-", _written(start[name]), _written(value))
-        for name, value in best.items()
-    ]
-    parts = [table(HEAD, rows), picture(found, lambda path: loss_curve(losses, path))]
+    units = {name: (is_ours and UNITS.get(name, "")) or "-" for name in best}
+    rows = [(name.replace("_", " "), units[name], *map(_written, (start[name], best[name]))) for name in best]
+    head = ("parameter", "unit", "first guess", "found")
+    parts = [table(head, rows), picture(found, lambda path: loss_curve(losses, path))]
     if is_ours:
         with suppress(CortadoError):  # the first guess may be a run that diverges
             parts.insert(0, picture(found, lambda path: _draw_ends(problem, [start, best], path)))

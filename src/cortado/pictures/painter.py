@@ -1,5 +1,4 @@
-"""Painters of scenes in 2-D and 3-D, texts and lines on pictures, colour scales, and the picture of a scene before a
-run."""
+"""Painters of scenes, texts and lines on pictures, colour scales, and the picture of a scene before a run."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -23,22 +22,14 @@ from cortado.scene.emitter_table import EmitterTable
 from cortado.scene.motions import courses
 from cortado.scene.parameters import QUANTITIES
 from cortado.scene.scene import Scene
-from cortado.scene.solids import SolidTable
 
 FINER = 3
 Text = tuple[tuple[int, int], str, str]
 """A text on a picture: its place (column, row), the text, and Pillow's two-letter anchor."""
-SMALL, SMALLEST = 11, 7
-"""Letter size on a small picture, and least letter size [pixels]."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 PALETTE = "viridis"
-OUTERMOST = (0.5, 99.5)
-"""Percentiles of the values at the ends of the colour scale."""
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
 MOVING = np.array([0.75, 0.20, 0.02])
-POSES = 60
-ARROW = 0.18
-HEAD = 0.22
 
 
 def painter(
@@ -50,14 +41,12 @@ def painter(
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the stage of a scene for fluid at positions (n, d) or (frames, n, d) [m]. The stage also contains the
-    solids at later ``poses``."""
+    """Return the stage for fluid at positions (n, d) or (frames, n, d) [m], and for the solids at later ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Return the linear colour of each particle (n, 3), mixed from the colours of its phases. ``colours`` (phases, 3)
-    replace the colours of the scene."""
+    """Return the linear colour of each particle (n, 3), mixed from ``colours`` (phases, 3), by default the scene's."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
@@ -67,8 +56,16 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
     """Draw a linear picture (rows, columns, 3) of a scene before a run, with paths, arrows and sizes. Particles are
     spheres at ``positions`` (n, d) [m] with linear colours (n, 3)."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
-    scene = scene.model_copy(update={"picture": look})
-    spacing, paths = scene.discretisation.spacing, _paths(scene)
+    scene, spacing = scene.model_copy(update={"picture": look}), scene.discretisation.spacing
+    paths, poses = list[Points](), list[Scene]()
+    for k, table in enumerate(scene.solid):
+        shifts = courses(table)[0] if table.motion == "path" else None
+        if isinstance(shifts, Knots):
+            paths.append(table.middle() + shifts.seen)
+            for place in paths[-1][:: max(len(shifts.seen) // 60, 1)].tolist():
+                moved = table.model_copy(update={"position": tuple(place)})
+                poses.append(scene.model_copy(update={"solid": (*scene.solid[:k], moved, *scene.solid[k + 1 :])}))
+    paths += [emitter.path.knots.seen for emitter in scene.emitter if emitter.path is not None]
     for emitter in scene.emitter:
         opening = emitter.opening(spacing)
         paths += [opening] if scene.dimension == 2 else []
@@ -76,46 +73,23 @@ def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") 
         shown = opening if scene.dimension == 3 or not len(positions) else opening[:0]
         positions = np.concatenate([positions, shown])
         colours = np.concatenate([colours, np.tile(MOVING, (len(shown), 1))])
-    draws = painter(scene, np.concatenate([positions, *paths]), device, _poses(scene))
+    draws = painter(scene, np.concatenate([positions, *paths]), device, poses)
     image, stage = draws.image(positions, colours), draws.stage
     ends = scene.container.extent() or (positions.min(axis=0) - 0.5 * spacing, positions.max(axis=0) + 0.5 * spacing)
-    thin = max(round(look.height / 240), 1)
-    edges = _edges(stage, *ends)
+    thin, edges = max(round(look.height / 240), 1), _edges(stage, *ends)
     image = lined(image, [stage.on_screen(path) for path in paths], MOVING, thin)
     image = lined(image, edges, INK, thin)
     return written(image, _sizes(stage, edges, *ends), max(round(0.030 * look.height), 10))
 
 
-def _paths(scene: Scene) -> list[Points]:
-    found = [places for table in scene.solid if (places := _places(table)) is not None]
-    return found + [emitter.path.knots.seen for emitter in scene.emitter if emitter.path is not None]
-
-
-def _places(table: SolidTable) -> Points | None:
-    """Return the positions of a solid's middle along its path (k, d) [m], or None without a path."""
-    shifts = courses(table)[0] if table.motion == "path" else None
-    return table.middle() + shifts.seen if isinstance(shifts, Knots) else None
-
-
-def _poses(scene: Scene) -> list[Scene]:
-    found = []
-    for k, table in enumerate(scene.solid):
-        places = _places(table)
-        several = () if places is None else places[:: max(len(places) // POSES, 1)].tolist()
-        for place in several:
-            moved = (*scene.solid[:k], table.model_copy(update={"position": tuple(place)}), *scene.solid[k + 1 :])
-            found.append(scene.model_copy(update={"solid": moved}))
-    return found
-
-
 def _arrow(scene: Scene, emitter: EmitterTable, positions: Points) -> Points:
     start, direction = np.array(emitter.outlet), np.array(emitter.direction)
     size = np.ptp(scene.container.extent() or positions, axis=0).max()
-    length = max(ARROW * float(size), emitter.width)
+    length = max(0.18 * float(size), emitter.width)
     tip = start + length * direction
     aside = np.eye(len(start))[int(np.abs(direction).argmin())]
     aside = aside - (aside @ direction) * direction
-    barbs = [tip - HEAD * length * (direction + sign * 0.5 * aside / np.linalg.norm(aside)) for sign in (1.0, -1.0)]
+    barbs = [tip - 0.22 * length * (direction + sign * 0.5 * aside / np.linalg.norm(aside)) for sign in (1.0, -1.0)]
     return np.array([start, tip, barbs[0], tip, barbs[1]])
 
 
@@ -141,18 +115,16 @@ def _sizes(stage: Any, edges: list[Points], lower: Points, upper: Points) -> lis
 
 
 def labelled(image: Points, text: str, below: str = "") -> Points:
-    """Write ``text`` at the upper left of a linear picture (rows, columns, 3) and ``below`` at the lower left. The
-    picture is changed in place."""
+    """Write ``text`` at the upper left of a picture (rows, columns, 3) and ``below`` at the lower left, in place."""
     rows, columns = image.shape[:2]
-    size = max(round(0.042 * rows), SMALL)
+    size = max(round(0.042 * rows), 11)
     left, top = round(0.9 * size), round(0.7 * size)
-    size = max(min(size, int(size * (columns - 2 * left) / max(length_of(text, size), 1.0))), SMALLEST)
+    size = max(min(size, int(size * (columns - 2 * left) / max(length_of(text, size), 1.0))), 7)
     return written(image, [((left, top), text, "la"), ((left, rows - top), below, "ld")], size)
 
 
 def written(image: Points, texts: Sequence[Text], size: int) -> Points:
-    """Write texts on a linear picture (rows, columns, 3), with letters of ``size`` pixels. The picture is changed in
-    place."""
+    """Write texts on a linear picture (rows, columns, 3) in place, with letters of ``size`` pixels."""
     where, cover = _covered(image.shape[:2], tuple(texts), size)
     image[where] = image[where] * (1.0 - cover) + INK * cover
     return image
@@ -223,9 +195,8 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """Make the scale for ``values``, such as the values of all frames of a film. Give the ``unit`` of a quantity
-        that exists only in some scenes."""
-        least, greatest = np.percentile(values, OUTERMOST)
+        """Make the scale for ``values``, such as all of a film. Give the ``unit`` of a quantity of some scenes only."""
+        least, greatest = np.percentile(values, (0.5, 99.5))
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
     def colours(self, values: NDArray) -> Points:
@@ -233,7 +204,7 @@ class Scale:
 
     def columns(self, rows: int) -> int:
         """Return the width of the scale in pixels for a picture with ``rows`` rows."""
-        size = _size_of_letters(rows)
+        size = max(round(0.026 * rows), 9)  # of letters
         return ceil(max(self._wide(size), *(length_of(text, size) for text in self._heads))) + size
 
     def beside(self, image: Points) -> Points:
@@ -243,10 +214,9 @@ class Scale:
         return self.on(np.concatenate([image, np.repeat(smooth[:, None], self.columns(rows), axis=1)], axis=1))
 
     def on(self, image: Points) -> Points:
-        """Return a picture (rows, columns, 3) with the scale drawn over its right edge. The greatest value is at the
-        top."""
+        """Return a picture (rows, columns, 3) with the scale over its right edge, the greatest value at the top."""
         rows, columns = image.shape[:2]
-        size = _size_of_letters(rows)
+        size = max(round(0.026 * rows), 9)  # of letters
         top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2
         left = right - ceil(self._wide(size))
         found, bar = np.array(image), _colours(np.linspace(1.0, 0.0, bottom - top))
@@ -275,17 +245,8 @@ class Scale:
 
 
 def _colours(shares: NDArray) -> Points:
-    found: Points = _palette()[np.minimum((len(_palette()) * shares).astype(int), len(_palette()) - 1)]
-    return found
-
-
-def _size_of_letters(rows: int) -> int:
-    return max(round(0.026 * rows), 9)
-
-
-@cache
-def _palette() -> Points:
     from matplotlib import colormaps
 
     palette = colormaps[PALETTE]
-    return from_srgb((255.0 * palette(np.arange(palette.N))[:, :3]).round().astype(np.uint8))
+    numbers = np.minimum((palette.N * shares).astype(int), palette.N - 1)
+    return from_srgb((255.0 * palette(np.arange(palette.N))[:, :3]).round().astype(np.uint8))[numbers]

@@ -21,15 +21,6 @@ from cortado.pictures.stage import upright
 from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, CylinderContainer
 
-MOST_BYTES = 2_200_000
-"""Greatest size of the data of an animation before base64 encoding [bytes]."""
-LEAST_FRAMES, MOST_FRAMES = 24, 120
-"""Least and greatest number of frames."""
-SHORTEST, LONGEST = 3.0, 12.0
-"""Least and greatest playing time [s]."""
-LARGEST = 32767
-_PLAIN = (0.1, 0.3, 0.8)
-
 
 @dataclass(frozen=True)
 class Cloud:
@@ -55,14 +46,14 @@ def script() -> str:
     return f"<script>\n{source}</script>"
 
 
-def thinned(frames: int, particles: int, numbers: int, most_bytes: int = MOST_BYTES) -> tuple[NDArray[np.intp], int]:
+def thinned(frames: int, particles: int, numbers: int, most_bytes: int = 2_200_000) -> tuple[NDArray[np.intp], int]:
     """Choose frames and a stride of particles, so that an animation needs at most ``most_bytes``.
 
     Args:
         numbers: bytes per particle and frame, summed over all clouds: two for each component of the position, one for
             the speed, three for a changing colour.
     """
-    count = min(frames, MOST_FRAMES, max(most_bytes // (numbers * particles), LEAST_FRAMES))
+    count = min(frames, 120, max(most_bytes // (numbers * particles), 24))  # 24 to 120 of them
     stride = max(-(-count * numbers * particles // most_bytes), 1)
     return np.unique(np.linspace(0, frames - 1, count).astype(int)), stride
 
@@ -85,12 +76,12 @@ def particle_view(
     lower, upper = np.nanmin(shown, axis=0).astype(float), np.nanmax(shown, axis=0).astype(float)
     middle, half = 0.5 * (lower + upper), np.maximum(0.5 * (upper - lower), 0.5 * spacing)
     fastest = max(float(np.nanmax(cloud.speeds, initial=0.0)) for cloud in clouds) or 1.0
-    plain = np.tile(_PLAIN, (particles, 1))
+    plain = np.tile((0.1, 0.3, 0.8), (particles, 1))
     drawn = [
         {
             "name": cloud.name,
             "still": cloud.colours is None or np.ndim(cloud.colours) == 2,
-            "positions": _base64(np.round((cloud.positions - middle) / half * LARGEST).astype("<i2")),
+            "positions": _base64(np.round((cloud.positions - middle) / half * 32767).astype("<i2")),
             "speeds": _base64(np.round(cloud.speeds / fastest * 255).astype(np.uint8)),
             "colours": _base64(srgb_bytes(plain if cloud.colours is None else cloud.colours)),
         }
@@ -100,27 +91,20 @@ def particle_view(
         "dimension": dimension,
         "particles": particles,
         "times": [float(f"{t:.6g}") for t in times],
-        "seconds": float(np.clip(len(times) / 20.0, SHORTEST, LONGEST)),
-        "half": _space(half).tolist(),
+        "seconds": float(np.clip(len(times) / 20.0, 3.0, 12.0)),
+        "half": _space(half),
         "radius": 0.56 * spacing * stride ** (1.0 / dimension),
-        "lines": _space(ends - middle).tolist(),
+        "lines": _space(ends - middle),
         "clouds": drawn,
     }
-    return _page(data, clouds, fastest, stride)
-
-
-def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride: int) -> str:
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    several = len(clouds) > 1
-    names = "".join(f'<span class="name">{escape(cloud.name)}</span>' for cloud in clouds) if several else ""
-    hint = "Drag to turn it. " if data["dimension"] == 3 else ""
+    names = "".join(f'<span class="name">{escape(cloud.name)}</span>' for cloud in clouds) if len(clouds) > 1 else ""
+    hint = "Drag to turn it. " if dimension == 3 else ""
     left_out = f" One particle in {stride} is shown." if stride > 1 else ""
-    coloured = any(cloud.colours is not None for cloud in clouds)
-    choices = [("phase", "phase"), ("speed", "speed")] if coloured else [("speed", "speed")]
-    options = "".join(f'<option value="{value}">{word}</option>' for value, word in choices)
+    choices = ["phase", "speed"] if any(cloud.colours is not None for cloud in clouds) else ["speed"]
+    options = "".join(f'<option value="{word}">{word}</option>' for word in choices)
     what = escape(" and ".join(cloud.name for cloud in clouds))
-    last = len(data["times"]) - 1
-    still = "" if last else " hidden"
+    last, still = len(times) - 1, "" if len(times) > 1 else " hidden"
     return f"""<div class="particle-view">
 <div class="stage">{names}
 <canvas tabindex="0" role="img" aria-label="Particles in motion: {what}"></canvas></div>
@@ -136,27 +120,30 @@ def _page(data: dict[str, Any], clouds: Sequence[Cloud], fastest: float, stride:
 </div>"""
 
 
-def _space(vectors: NDArray[Any]) -> NDArray[Any]:
+def _space(vectors: NDArray[Any]) -> Any:
     padded = in_space(vectors)
-    return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape)
+    return np.array([float(f"{number:.6g}") for number in padded.ravel()]).reshape(padded.shape).tolist()
 
 
 def _base64(array: NDArray[Any]) -> str:
     return b64encode(np.ascontiguousarray(array).tobytes()).decode()
 
 
-ROUND = 48
-
-
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
-    """Return HTML that shows runs of a scene side by side. ``runs`` maps a name to the states at ``times`` (frames,)
-    [s]."""
+    """Return HTML that shows runs of a scene side by side, given by name their states at ``times`` (frames,) [s]."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
     numbers = len(states) * (2 * scene.dimension + 1 + 3 * (len(scene.phase) > 1))
     chosen, stride = thinned(len(times), particles, numbers)
-    clouds = [_cloud(scene, name, [of_run[k] for k in chosen], turn, stride) for name, of_run in states.items()]
+    clouds = []
+    for name, of_run in states.items():
+        shown = [of_run[k] for k in chosen]
+        positions = scene.domain.wrapped(np.stack([state.positions[::stride] for state in shown])) @ turn.T
+        speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in shown])
+        fractions = [None if state.mass_fractions is None else state.mass_fractions[::stride] for state in shown]
+        each = [colours_of(scene, one, positions.shape[1]) for one in (fractions if len(scene.phase) > 1 else [None])]
+        clouds.append(Cloud(name, positions, speeds, np.stack(each) if len(scene.phase) > 1 else each[0]))
     still = tuple(table for table in scene.solid if table.motion == "fixed")
     lines = outline(scene.model_copy(update={"solid": still})) @ turn.T
     return particle_view(clouds, times[chosen], scene.discretisation.spacing, lines=lines, stride=stride)
@@ -176,21 +163,11 @@ def container_outline(scene: Scene) -> Points:
         places = corners(*ends)
         pairs = [(a, b) for a in range(len(places)) for b in range(a) if np.count_nonzero(places[a] != places[b]) == 1]
         return places[np.array(pairs)]
-    angles = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
+    angles = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     axis = INDEX_OF_AXIS[container.axis]
     circle = np.insert(container.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), axis, 0.0, axis=1)
     low = circle + np.asarray(container.base)
     high = low + container.height * np.eye(3)[axis]
     rims = [np.stack([rim, np.roll(rim, -1, axis=0)], axis=1) for rim in (low, high)]
-    sides = np.stack([low, high], axis=1)[:: ROUND // 4]
+    sides = np.stack([low, high], axis=1)[:: len(angles) // 4]
     return np.concatenate([*rims, sides])
-
-
-def _cloud(scene: Scene, name: str, states: list[Any], turn: Points, stride: int) -> Cloud:
-    positions = scene.domain.wrapped(np.stack([state.positions[::stride] for state in states])) @ turn.T
-    speeds = np.stack([np.linalg.norm(state.velocities[::stride], axis=1) for state in states])
-    if len(scene.phase) == 1:
-        return Cloud(name, positions, speeds, colours_of(scene, None, positions.shape[1]))
-    fractions = [None if state.mass_fractions is None else state.mass_fractions[::stride] for state in states]
-    colours = np.stack([colours_of(scene, one, positions.shape[1]) for one in fractions])
-    return Cloud(name, positions, speeds, colours)

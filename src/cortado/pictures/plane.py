@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cortado.device.threads import usable_cores
 from cortado.discretise.shapes import Points, wrapped
@@ -19,6 +18,12 @@ from cortado.scene.shape_tables import BoxContainer
 
 LIGHT = (-0.45, 0.70, 0.55)
 """Direction to the lamp: right, up, and towards the viewer."""
+BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
+"""Softness, downward offset and greatest distance of shadows, relative to the size of the contents."""
+Layer = tuple[Points, Points]
+"""Opacity (rows, columns, 1) and colours (rows, columns, 3) of a layer."""
+SUPPORT = 1.3
+"""Support radius of a particle's field [spacings]."""
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
@@ -45,19 +50,6 @@ def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) 
     gleam = np.clip(normal @ half, 0.0, 1.0) ** 60 - half[2] ** 60
     deep = 0.80 + 0.20 * height
     return colour * (np.minimum(diffuse, 1.12) * deep)[..., None] + gleaming * np.clip(gleam, 0.0, 1.0)[..., None]
-
-
-FILLED = 0.80
-"""Fraction of the picture's width or height that the contents fill."""
-GLASS = (0.40, 0.50, 0.55)
-GLEAM, GLEAM_OF_MIRRORS = 0.12, 0.7
-"""Brightness of the lamp's reflection in dull solids and in mirrors."""
-SOLID_SHADOW = 0.25
-"""Darkening of the paper in the shadow of a solid."""
-BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
-"""Softness, downward offset and greatest distance of shadows, relative to the size of the contents."""
-Layer = tuple[Points, Points]
-"""Opacity (rows, columns, 1) and colours (rows, columns, 3) of a layer."""
 
 
 @dataclass(frozen=True)
@@ -105,57 +97,74 @@ class PlaneStage:
     def pixel(self) -> float:
         """Width of a pixel [m]."""
         size = np.array([self.picture.width, self.picture.height])
-        return float((self.seen_size / (FILLED * size)).max())
+        return float((self.seen_size / (0.80 * size)).max())  # of which the contents fill 0.8
 
     @property
-    def _middle(self) -> Points:
+    def middle(self) -> Points:
         lower, upper = self.seen or self.ends
         return 0.5 * (lower + upper)
 
     @cached_property
     def pixels(self) -> tuple[Points, Points]:
         """Coordinates x and y of the middle of each pixel (rows, columns) [m]."""
-        columns, rows, middle = self.picture.width, self.picture.height, self._middle
+        columns, rows, middle = self.picture.width, self.picture.height, self.middle
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
-    def is_near(self, points: Points, margin: float) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the points (n, 2) [m] that are at most ``margin`` [m] outside the picture."""
-        half = 0.5 * self.pixel * np.array([self.picture.width, self.picture.height])
-        return np.asarray((np.abs(points - self._middle) <= half + margin).all(axis=1))
-
     def on_screen(self, points: Points) -> Points:
         """Return the column and row in the picture (n, 2) of points (n, 2) [m]."""
-        off = (points - self._middle) / self.pixel
+        off = (points - self.middle) / self.pixel
         return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
 
     up_axis = 1
 
     @property
-    def gloss_width(self) -> float:
-        """Width of the glossy edge in pixels."""
+    def gloss_width(self) -> float:  # of the edge, in pixels
         return max(0.55 * self.spacing / self.pixel, 1.5)
 
     @cached_property
     def behind(self) -> Points:
         """Draw the background of the fluid (rows, columns, 3): paper with shadows, and the inside of the container."""
-        (x, y), middle, half = self.pixels, self._middle, 0.5 * self.pixel * self.picture.width
+        (x, y), middle, half = self.pixels, self.middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
         paper = np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
-        if self.container is not None or self._tanks:
-            outside = paper * (1.0 - self._shadow() * (1.0 - self._room))[..., None]
+        blur, drop = BLUR * self._size, DROPPED * self._size
+
+        def edge(distance: Points) -> Points:
+            return 0.5 * (1.0 + np.tanh(distance / blur))
+
+        shadows = [0.28 * self._below(shown) for shown, _ in self._tanks]
+        if self.container is not None:
+            across = edge(x - self.lower[0]) * edge(self.upper[0] - x)
+            shadows.append(0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop))
+        if shadows:
+            outside = paper * (1.0 - np.max(shadows, axis=0) * (1.0 - self._room))[..., None]
             paper = outside + (1.0 - paper) * (0.40 * self._room)[..., None]
         for shown, _ in self._bodies:
-            darker = SOLID_SHADOW * (1.0 - shown.transparency) * self._below(shown) * self._room
+            darker = 0.25 * (1.0 - shown.transparency) * self._below(shown) * self._room
             paper = paper * (1.0 - darker)[..., None]
         return paper
 
     @cached_property
     def before(self) -> list[Layer]:
-        layers = [self._body(shown, distance) for shown, distance in self._bodies]
+        layers, (x, y) = list[Layer](), self.pixels
+        for shown, distance in self._bodies:
+            cover = self._covered(distance)
+            gleaming = 0.12 + (0.7 - 0.12) * shown.finish.reflectivity  # 0.12 of dull solids, 0.7 of mirrors
+            light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
+            opacity = ((1.0 - shown.transparency) * cover * self._room)[..., None]
+            layers.append((opacity, opacity * light))
         if self.container is not None:
-            layers.append(self._container_walls(self.container))
+            off = np.stack([x, y]) - (0.5 * (self.lower + self.upper))[:, None, None]
+            beyond = np.abs(off) - (0.5 * (self.upper - self.lower))[:, None, None]
+            outside = np.hypot(*np.maximum(beyond, 0.0))
+            distance = np.where(outside > 0.0, outside, beyond.max(axis=0))  # from the inner side, outwards
+            part: Points | float = 1.0
+            for axis in (axis for axis in range(2) if self.container.periodic[axis]):
+                part = part * (beyond[axis] < 0.0)
+            colour = (0.40, 0.50, 0.55) if self.container.finish is None else self.container.finish.colour
+            layers.append(self._walls(distance, part, np.array(colour)))
         return layers + [self._walls(distance, 1.0, shown.colour) for shown, distance in self._tanks]
 
     @cached_property
@@ -180,8 +189,7 @@ class PlaneStage:
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
-        """Return the signed distance from a solid (rows, columns) [m], measured ``drop`` [m] above each pixel. It is
-        negative inside the solid."""
+        """Return the signed distance from a solid (rows, columns) [m], < 0 inside, ``drop`` [m] above each pixel."""
         (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
         columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
         rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
@@ -209,44 +217,10 @@ class PlaneStage:
     def _size(self) -> float:
         return float((self.upper - self.lower).max())
 
-    def _shadow(self) -> Points:
-        """Return the darkening of the paper behind the container and tanks (rows, columns)."""
-        tanks = [0.28 * self._below(shown) for shown, _ in self._tanks]
-        if self.container is None:
-            return np.max(tanks, axis=0)
-        x, y = self.pixels
-        blur, drop = BLUR * self._size, DROPPED * self._size
-
-        def edge(distance: Points) -> Points:
-            return 0.5 * (1.0 + np.tanh(distance / blur))
-
-        across = edge(x - self.lower[0]) * edge(self.upper[0] - x)
-        return np.max([0.28 * across * edge(y + drop - self.lower[1]) * edge(self.upper[1] - y - drop), *tanks], axis=0)
-
     def _below(self, shown: ShownSolid) -> Points:
         """Return the darkening of the paper by the shadow of a solid (rows, columns)."""
         distance = self._distance(shown, DROPPED * self._size)
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
-
-    def _body(self, shown: ShownSolid, distance: Points) -> Layer:
-        cover = self._covered(distance)
-        gleaming = GLEAM + (GLEAM_OF_MIRRORS - GLEAM) * shown.finish.reflectivity
-        light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
-        opacity = ((1.0 - shown.transparency) * cover * self._room)[..., None]
-        return opacity, opacity * light
-
-    def _container_walls(self, container: BoxContainer) -> Layer:
-        x, y = self.pixels
-        half = 0.5 * (self.upper - self.lower)
-        off = np.stack([x, y]) - (0.5 * (self.lower + self.upper))[:, None, None]
-        beyond = np.abs(off) - half[:, None, None]
-        outside = np.hypot(*np.maximum(beyond, 0.0))
-        distance = np.where(outside > 0.0, outside, beyond.max(axis=0))  # from the inner side, outwards
-        part: Points | float = 1.0
-        for axis in range(2):
-            if container.periodic[axis]:
-                part = part * (beyond[axis] < 0.0)
-        return self._walls(distance, part, np.array(GLASS if container.finish is None else container.finish.colour))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
         """Return the layer of walls. ``distance`` is the distance of the pixels from the inner side [m]."""
@@ -257,29 +231,18 @@ class PlaneStage:
         return opacity, opacity * colour * shine[..., None]
 
 
-SUPPORT = 1.3
-"""Support radius of a particle's field [spacings]."""
-DROP = 0.8
-"""Strength of the field of an isolated particle."""
-GRID = 4
-"""Number of field nodes per spacing along an axis."""
-TOUCHING = 0.9
-"""Distance from a wall below which fluid touches the wall [spacings]."""
-
-
 @dataclass(frozen=True)
 class PlanePainter:
     stage: PlaneStage
 
     def image(self, *state: Any) -> Points:
         positions, colours, pose = State(*state)[:3]
-        own = self if pose is None else PlanePainter(replace(self.stage, solids=shown_solids(pose)))
-        return own._drawn(np.asarray(positions, dtype=np.float64), np.asarray(colours, dtype=np.float64))
-
-    def _drawn(self, positions: Points, colours: Points) -> Points:
-        stage, (cover, colour) = self.stage, self._fluid(positions, colours)
-        body, width = np.where(stage.free > 0.5, cover, 1.0), stage.gloss_width
-        fluid = glossy(body, colour, width) if stage.picture.shaded else colour
+        if pose is not None:
+            return PlanePainter(replace(self.stage, solids=shown_solids(pose))).image(positions, colours)
+        cover, colour = self._fluid(*(np.asarray(one, dtype=np.float64) for one in (positions, colours)))
+        stage = self.stage
+        body = np.where(stage.free > 0.5, cover, 1.0)
+        fluid = glossy(body, colour, stage.gloss_width) if stage.picture.shaded else colour
         alpha = (cover * stage.shown)[..., None]
         image = stage.behind * (1.0 - alpha) + fluid * alpha
         for opacity, light in stage.before:
@@ -294,15 +257,17 @@ class PlanePainter:
         order = np.lexsort(positions.T)  # so that sums do not depend on the order of the particles
         positions, colours = positions[order], colours[order]
         wet, of = self._wetting(positions)
-        reach, cell = 2.0 * SUPPORT * self.stage.spacing, self.stage.spacing / GRID
-        near = self.stage.is_near(wet, 2.0 * reach)  # the grid would be as large as what is spilt comes far
+        reach, cell = 2.0 * SUPPORT * self.stage.spacing, self.stage.spacing / 4
+        half = 0.5 * self.stage.pixel * np.array([self.stage.picture.width, self.stage.picture.height])
+        # the grid would be as large as what is spilt comes far
+        near = (np.abs(wet - self.stage.middle) <= half + 2.0 * reach).all(axis=1)
         wet, of = wet[near], of[near]
         if not len(wet):
             empty = np.zeros(self.stage.pixels[0].shape)
             return empty, np.zeros((*empty.shape, 3))
         distances, _ = cKDTree(wet).query(wet, k=24, distance_upper_bound=reach, workers=usable_cores())
         own = _weight(distances, reach)
-        strength = np.minimum(1.0 / own.sum(axis=1), DROP)
+        strength = np.minimum(1.0 / own.sum(axis=1), 0.8)  # 0.8 for one alone
         corner = wet.min(axis=0) - reach
         counts = np.ceil((wet.max(axis=0) + reach - corner) / cell).astype(int) + 1
         field, tinted = _splat(wet, strength, colours[of], corner, cell, counts, reach)
@@ -317,9 +282,8 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Return positions (n, 2) of particles and of their mirror images and periodic images. Also return the particle
-        number of each position."""
-        stage, of, reach = self.stage, np.arange(len(positions)), TOUCHING * self.stage.spacing
+        """Return positions (n, 2) of particles and of their images, and the particle number of each position."""
+        stage, of, reach = self.stage, np.arange(len(positions)), 0.9 * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)
         if stage.solids:
@@ -343,8 +307,7 @@ def _weight(distances: Points, reach: float) -> Points:
 def _splat(
     positions: Points, strength: Points, colours: Points, corner: Points, cell: float, counts: np.ndarray, reach: float
 ) -> tuple[Points, Points]:
-    """Return the sum of the particles' fields at nodes (nx, ny), and the mean colour of nearby particles (3,
-    nx, ny)."""
+    """Return the sum of the fields at nodes (nx, ny), and the mean colour of near particles (3, nx, ny)."""
     patch = np.arange(-int(reach / cell) - 1, int(reach / cell) + 2)
     nearest = np.rint((positions - corner) / cell).astype(int)
     size = int(np.prod(counts))

@@ -89,8 +89,7 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot each component of ``found`` (k, c) over ``x`` (k,) in a separate panel. ``true`` and ``start`` are (c,) or
-    (k, c)."""
+    """Plot each component of ``found`` (k, c) over ``x`` (k,) in a panel. ``true`` and ``start`` are (c,) or (k, c)."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
     with drawing(path, height=1.6 + 1.9 * count) as figure:
@@ -111,15 +110,12 @@ def panels(
     return Path(path)
 
 
-_MOST_IN_A_ROW = 4
-
-
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path) -> Path:
     """Plot linear images (rows, columns, 3) in a row. More than four images form a grid."""
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
         raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
-    across = len(shown) if len(shown) <= _MOST_IN_A_ROW else ceil(sqrt(len(shown)))
+    across = len(shown) if len(shown) <= 4 else ceil(sqrt(len(shown)))
     down = -(-len(shown) // across)
     tallness = max(image.shape[0] / image.shape[1] for image in shown)
     panel = min(6.0, 11.0 / across, 7.0 / tallness)  # width [inch]
@@ -134,12 +130,6 @@ def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path)
     return Path(path)
 
 
-_FAR, _NEAR = "#c9d9e4", "#27506f"
-_MOST_DRAWN = 150_000
-_SHOWN_RANGE = (0.0, 99.5)
-"""Percentiles of the values at the ends of a colour scale."""
-
-
 def particles(
     positions: Sequence[ArrayLike],
     titles: Sequence[str],
@@ -149,7 +139,6 @@ def particles(
     colour_label: str = "",
     container: tuple[ArrayLike, ArrayLike] | None = None,
     lines: Sequence[ArrayLike] | None = None,
-    dimension: int | None = None,
 ) -> Path:
     """Plot particle sets side by side, such as before, after and target.
 
@@ -163,12 +152,11 @@ def particles(
         colour_label: label of the colour scale, with its unit.
         container: lower and upper corner (d,) [m] of the container, whose outline is drawn.
         lines: for each panel (k, 2, d) end points of lines [m], drawn over the particles, such as outlines of solids.
-        dimension: 2 or 3, by default the dimension of the first set. In 2-D a third component is ignored.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 
-    sets = [np.asarray(one, dtype=float)[:, :dimension] for one in positions]
+    sets = [np.asarray(one, dtype=float) for one in positions]
     values = [None] * len(sets) if colours is None else [np.asarray(one, dtype=float) for one in colours]
     ends = [np.asarray(one, dtype=float)[:, :, :2] for one in lines or [np.zeros((0, 2, 2))] * len(sets)]
     lower, upper = _bounds([*sets, *(one.reshape(-1, 2) for one in ends)], container)
@@ -177,9 +165,9 @@ def particles(
     width, height = max(panel * len(sets) + 1.2, 8.0), max(panel * up / across + 1.2, 3.6)
     with drawing(path, width, height) as figure:
         panels = figure.subplots(1, len(sets), sharex=True, sharey=True, squeeze=False)[0]
-        scale = _ColourScale(sets, values)
-        for axes, points, own, title, drawn in zip(panels, sets, values, titles, ends, strict=True):
-            _draw_set(axes, points, scale.rgb(points, own), title)
+        shades, mappable, extend = _colour_scale(sets, values)
+        for axes, points, own, title, drawn in zip(panels, sets, shades, titles, ends, strict=True):
+            _draw_set(axes, points, own, title)
             if container is not None:
                 low, high = np.asarray(container, dtype=float)[:, :2]
                 axes.add_patch(Rectangle(low, *(high - low), fill=False, edgecolor=FAINT, linewidth=1.4))
@@ -188,10 +176,9 @@ def particles(
             axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal", xlabel="x [m]")
             axes.grid(False)
         panels[0].set_ylabel("y [m]")
-        if scale.mappable is not None:
-            extend = "max" if scale.clips else "neither"
+        if mappable is not None:
             style = {"shrink": 0.8, "aspect": 30, "pad": 0.015, "extend": extend}
-            figure.colorbar(scale.mappable, ax=panels, label=colour_label, **style)
+            figure.colorbar(mappable, ax=panels, label=colour_label, **style)
     return Path(path)
 
 
@@ -207,29 +194,22 @@ def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -
     return lower - margin, upper + margin
 
 
-class _ColourScale:
-    """A map from numbers or colours of particles to red, green and blue, shared by all panels."""
+def _colour_scale(sets: list[Points], colours: Sequence[NDArray | None]) -> tuple[list[NDArray], Any, str]:
+    """Return red, green and blue of the points of each panel (n, 3), from 0 to 1. Points without colours are shaded by
+    depth. Also return the scale of numbers, or None, and the end at which it clips."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-    def __init__(self, sets: list[NDArray[Any]], colours: Sequence[NDArray[Any] | None]) -> None:
-        from matplotlib.cm import ScalarMappable
-        from matplotlib.colors import LinearSegmentedColormap, Normalize
-
-        numbers = [one for one in colours if one is not None and one.ndim == 1]
-        depths = [_depth(points) for points in sets]
-        values = np.concatenate(numbers or depths)
-        values = values[np.isfinite(values)]
-        low, high = np.percentile(values, _SHOWN_RANGE) if len(values) else (0.0, 1.0)
-        self.clips = bool(len(values) and values.max() > high)
-        flat = high - low <= 1e-12 * max(abs(high), abs(low))  # one value, or plane: the near colour
-        by_depth = LinearSegmentedColormap.from_list("depth", [_FAR, _NEAR])
-        self._map = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "viridis" if numbers else by_depth)
-        self.mappable = self._map if numbers else None
-
-    def rgb(self, points: NDArray[Any], colours: NDArray[Any] | None) -> NDArray[Any]:
-        """Return the colours of points (n, 3) from 0 to 1. If ``colours`` is None, points are shaded by depth."""
-        if colours is not None and colours.ndim == 2:
-            return srgb_bytes(colours) / 255.0
-        return self._map.to_rgba(_depth(points) if colours is None else colours)[:, :3]
+    numbers = [one for one in colours if one is not None and one.ndim == 1]
+    shown = [_depth(points) if one is None else one for points, one in zip(sets, colours, strict=True)]
+    values = np.concatenate(numbers or [_depth(points) for points in sets])
+    values = values[np.isfinite(values)]
+    low, high = np.percentile(values, (0.0, 99.5)) if len(values) else (0.0, 1.0)
+    flat = high - low <= 1e-12 * max(abs(high), abs(low))  # one value, or plane: the near colour
+    by_depth = LinearSegmentedColormap.from_list("depth", ["#c9d9e4", "#27506f"])
+    scale = ScalarMappable(Normalize(low - 1.0 if flat else low, high), "viridis" if numbers else by_depth)
+    shades = [srgb_bytes(one) / 255.0 if one.ndim == 2 else scale.to_rgba(one)[:, :3] for one in shown]
+    return shades, scale if numbers else None, "max" if len(values) and values.max() > high else "neither"
 
 
 def _depth(points: NDArray[Any]) -> NDArray[Any]:
@@ -241,7 +221,7 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
 
     kept = np.flatnonzero(np.isfinite(points).all(axis=1))
     notes = [f"{len(points) - len(kept)} not finite"] if len(kept) < len(points) else []
-    every = -(-len(kept) // _MOST_DRAWN) or 1
+    every = -(-len(kept) // 150_000) or 1
     if every > 1:
         notes.append(f"one in {every} drawn")
     axes.set_title("\n".join([title, *notes]))

@@ -37,6 +37,9 @@ from cortado.scene.tables import field_name
 from cortado.simulation import Simulation
 
 SHEET = 3
+Settings = Mapping[str, Any]
+Given = Scene | str | Path | None
+"""A scene, the path of its file, or None for the scene of the trajectory."""
 
 
 def run_pictures(
@@ -54,17 +57,15 @@ def run_pictures(
     if picture.film_frames == 0 or not last:
         return stills
     small = {"width": max(picture.width // SHEET, LEAST_PIXELS), "height": max(picture.height // SHEET, LEAST_PIXELS)}
-    parts, page = (
-        run_page(replace(run, scene=scene.model_copy(update={"picture": one})), device)
-        for one in (picture.for_films.model_copy(update=small), picture.for_films)
-    )
+    looks = [picture.for_films.model_copy(update=small), picture.for_films]
+    scenes = [scene.model_copy(update={"picture": look}) for look in looks]
+    parts, page = (run_page(replace(run, scene=one), device) for one in scenes)
     shown = np.linspace(0, last, min(SHEET * SHEET, last + 1)).round().astype(int).tolist()
     names = [f"{trajectory.times[k]:.3g} s" for k in shown]
     path = write_picture(folder / "sheet.png", side_by_side([parts.image(k) for k in shown], SHEET, names))
     stills.append(("The whole run, from the start to the end.", path))
-    made = film(
-        folder / "film.mp4", page, range(last + 1), pace_of(trajectory.due, picture, common_rate([trajectory.marks]))
-    )
+    pace = pace_of(trajectory.due, picture, common_rate([trajectory.marks]))
+    made = film(folder / "film.mp4", page, range(last + 1), pace)
     announce(f"{made}{f'; cortado picture {folder.parent} --film traces its light' if is_quick else ''}")
     return [(f"The run, {made.pace.in_words}.", made.path), *stills]
 
@@ -86,23 +87,16 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
     return stage.framed(stage.ends, stage.picture.model_copy(update={"width": free})), scale.beside
 
 
-Units = Mapping[str, str]
-Settings = Mapping[str, Any]
-Given = Scene | str | Path | None
-"""A scene, the path of its file, or None for the scene of the trajectory."""
-
-
 def shown_run(
-    trajectory: Trajectory, scene: Scene, settings: Settings, units: Units | None = None, simulation: Computed = None
+    trajectory: Trajectory, scene: Scene, settings: Settings, units: Any = None, simulation: Computed = None
 ) -> ShownRun:
-    """Return a run prepared for pictures, with keys of [picture] replaced. ``simulation`` computes colours that were
-    not recorded."""
+    """Return a run with replaced keys of [picture]. ``simulation`` computes colours that were not recorded."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units
-    pictured = shown_as(scene, settings, known)
-    unit = known.get((pictured.picture or Picture()).colour)
-    return ShownRun(pictured, trajectory, coloured_by(pictured, trajectory, simulation), unit)
+    scene = shown_as(scene, settings, known)
+    unit = known.get((scene.picture or Picture()).colour)
+    return ShownRun(scene, trajectory, coloured_by(scene, trajectory, simulation), unit)
 
 
 def film_of(run: ShownRun, path: str | Path, device: Any) -> Film:
@@ -117,10 +111,19 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Settings)
         raise InputError(f"frame is {shown(frame)}, but must be one frame of a trajectory, such as trajectory[-1].")
     units = _units_of_fields(simulation)
     if (shown_as(simulation.scene, settings, units).picture or Picture()).colour == "age":
-        raise InputError(
-            'The age of fluid cannot be computed from one frame: take trajectory.picture(k, colour="age").'
-        )
-    run = shown_run(_alone(frame), simulation.scene, settings, units)
+        advice = 'take trajectory.picture(k, colour="age")'
+        raise InputError(f"The age of fluid cannot be computed from one frame: {advice}.")
+    alone = Trajectory(
+        times=np.array([frame.time]),
+        steps=np.zeros(1, dtype=int),
+        positions=frame.positions[None],
+        velocities=frame.velocities[None],
+        diagnostics={"converged": np.zeros(0, dtype=bool)},
+        mass_fractions=None if frame.mass_fractions is None else frame.mass_fractions[None],
+        others={name: values[None] for name, values in frame.others.items()},
+        quantities={name: values[None] for name, values in frame.quantities.items()},
+    )
+    run = shown_run(alone, simulation.scene, settings, units)
     return ShadedPicture.of(run_page(run, simulation.device).image(0))
 
 
@@ -163,23 +166,6 @@ def _units_of_fields(simulation: Simulation) -> dict[str, str]:
     return {field.name: field.unit for field in known if field.name not in NAMES}
 
 
-def _alone(frame: Frame) -> Trajectory:
-    return Trajectory(
-        times=np.array([frame.time]),
-        steps=np.zeros(1, dtype=int),
-        positions=frame.positions[None],
-        velocities=frame.velocities[None],
-        diagnostics={"converged": np.zeros(0, dtype=bool)},
-        mass_fractions=None if frame.mass_fractions is None else frame.mass_fractions[None],
-        others={name: values[None] for name, values in frame.others.items()},
-        quantities={name: values[None] for name, values in frame.quantities.items()},
-    )
-
-
-WIDE = 16.0 / 9.0
-"""Aspect ratio of pictures if the user sets only the number of lines."""
-
-
 def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> Scene:
     """Return the scene with keys of [picture] replaced by ``settings``. ``colour`` may also name one of ``fields``.
     Raises `SceneError` for invalid settings."""
@@ -187,7 +173,7 @@ def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> 
     wanted = {**given, **settings}
     if "lines" in settings:
         lines = whole_number("lines", wanted.pop("lines"), 64)
-        wanted |= {"width": 2 * round(0.5 * WIDE * lines), "height": lines}
+        wanted |= {"width": 2 * round(8.0 / 9.0 * lines), "height": lines}  # 16:9
     if isinstance(wanted.get("camera"), CameraPath):
         wanted |= {"camera": given.get("camera"), "camera_path": wanted["camera"].model_dump()}
     own = wanted.get("colour")
@@ -204,8 +190,7 @@ def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot the density error [%] and the iterations of each solver loop over time steps. Steps that did not converge
-    are marked."""
+    """Plot density error [%] and iterations of each solver loop over time steps, and mark unconverged steps."""
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
@@ -321,11 +306,8 @@ def _horizon(axes: Any, horizon: Horizon | None) -> None:
         _empty(axes, "no horizon of a wrong adjoint")
         return
     for values, label, colour in ((horizon.exact, "exact", 6), (horizon.difference, "of a meaningful perturbation", 0)):
-        size = np.abs(values)
-        there = size > 0.0
-        axes.semilogy(
-            horizon.sample_steps[there], size[there], "o-", markersize=3.5, color=PALETTE[colour], label=label
-        )
+        there, style = np.abs(values) > 0.0, {"markersize": 3.5, "color": PALETTE[colour], "label": label}
+        axes.semilogy(horizon.sample_steps[there], np.abs(values)[there], "o-", **style)
     for step, label, shade in ((horizon.measured, "measured", INK), (horizon.predicted, "predicted", FAINT)):
         if step is not None:
             axes.axvline(step, **DASHED, color=shade, label=f"{label} horizon: {step}")

@@ -17,17 +17,7 @@ from cortado.calls import public
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError, shown
 from cortado.files.disk import as_path
-from cortado.pictures.film import (
-    MOST_PICTURES,
-    Around,
-    Page,
-    Panel,
-    ShownRun,
-    coloured_by,
-    film,
-    framed_together,
-    lacking,
-)
+from cortado.pictures.film import Around, Page, Panel, ShownRun, coloured_by, film, framed_together, lacking
 from cortado.pictures.painter import Scale, labelled, side_by_side
 from cortado.pictures.run_pictures import device_of, shown_as
 from cortado.runs.frames import Film, common_rate, pace_of
@@ -36,6 +26,9 @@ from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Picture
 from cortado.scene.scene import Scene, as_scene
 from cortado.scene.schema_words import unit_of
+
+SAME = 0.01
+MOST_PICTURES = 9
 
 
 @public
@@ -66,7 +59,13 @@ def film_side_by_side(
 
     Example: ``cortado.film_side_by_side({"thin": first, "thick": second}, "both.mp4")``
     """
-    each = _trajectories(runs)
+    given = runs.values() if isinstance(runs, Mapping) else runs
+    if not isinstance(given, Iterable) or isinstance(runs, Trajectory):
+        raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
+    each = list(given)
+    for run in each:
+        if not isinstance(run, Trajectory):
+            raise InputError(f"runs has {shown(run)}, but must have trajectories, as simulation.run returns them.")
     if scenes is not None and len(scenes) != len(each):
         raise InputError(f"scenes has {len(scenes)} scenes, but must have one for each of {len(each)} runs.")
     known = [run.scene for run in each] if scenes is None else [as_scene(one) for one in scenes]
@@ -77,28 +76,14 @@ def film_side_by_side(
     numbers = [f"run {k}" for k in range(1, len(each) + 1)]
     names = [str(name) for name in runs] if isinstance(runs, Mapping) else labels(there, numbers)
     values = [coloured_by(scene, run) for scene, run in zip(pictured, each, strict=True)]
-    page, times = runs_page(
-        [ShownRun(*one) for one in zip(pictured, each, values, strict=True)], names, device_of(device)
-    )
-    picture = pictured[0].picture or Picture()
-    pace = pace_of(times, picture, common_rate(run.marks for run in each))
+    shown_runs = [ShownRun(*one) for one in zip(pictured, each, values, strict=True)]
+    page, times = runs_page(shown_runs, names, device_of(device))
+    pace = pace_of(times, pictured[0].picture or Picture(), common_rate(run.marks for run in each))
     return film(Path(as_path("path", path)), page, range(len(times)), pace)
 
 
-def _trajectories(runs: Any) -> list[Trajectory]:
-    each = runs.values() if isinstance(runs, Mapping) else runs
-    if not isinstance(each, Iterable) or isinstance(runs, Trajectory):
-        raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
-    found = list(each)
-    for run in found:
-        if not isinstance(run, Trajectory):
-            raise InputError(f"runs has {shown(run)}, but must have trajectories, as simulation.run returns them.")
-    return found
-
-
 def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
-    """Return the scenes of runs with the table [picture] of the first scene. Raises `InputError` for runs that cannot
-    be shown together."""
+    """Return the scenes with the first one's [picture]. Raises `InputError` for runs that do not fit together."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -114,8 +99,7 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Return a page of runs and the times of its frames [s]. Each run is labelled with its name and time. Prepare the
-    scenes by `shown_alike`."""
+    """Return a page of runs, labelled with name and time, and its times [s]. `shown_alike` prepares the scenes."""
     times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -123,12 +107,10 @@ def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tu
     spare = 0 if scale is None else scale.columns(picture.height)
     stages, across = framed_together([run.stage for run in runs], spare)
     shown = [ShownFrames(run.times, times) for run in runs]
-    panels = [
-        _labelled(run.panel(stage, device, scale), name, frames)
-        for run, stage, name, frames in zip(runs, stages, names, shown, strict=True)
-    ]
+    drawn = [run.panel(stage, device, scale) for run, stage in zip(runs, stages, strict=True)]
+    panels = [_labelled(*one) for one in zip(drawn, names, shown, strict=True)]
     notes = [note for name, frames in zip(names, shown, strict=True) for note in frames.notes(name)]
-    off = max(frames.off for frames in shown)
+    off = max(float(np.abs(one.own[one.nearest] - times)[one.during].max(initial=0.0)) for one in shown)
     if off > SAME * interval_of(times):
         notes.append(f"each run shows its recorded frame nearest in time, at most {off:.2g} s away")
 
@@ -148,12 +130,8 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
     return drawn
 
 
-SAME = 0.01
-
-
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] of a film of several runs. The run with the highest frame rate determines the
-    interval."""
+    """Return the times (frames,) [s] of a film of several runs, at the interval of the run with the most frames."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -189,11 +167,6 @@ class ShownFrames:
         near = SAME * interval_of(self.times)
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
-    @property
-    def off(self) -> float:
-        """Greatest difference between the times of the film and the times of the shown frames [s]."""
-        return float(np.abs(self.own[self.nearest] - self.times)[self.during].max(initial=0.0))
-
     def time_in_words(self, k: int) -> str:
         """Describe the recording time of frame k."""
         interval = interval_of(self.times)
@@ -207,10 +180,6 @@ class ShownFrames:
         return [note for note, is_on in ((begins, self.during[0]), (ends, self.during[-1])) if not is_on]
 
 
-MOST_KEYS, LONGEST = 3, 64
-"""Greatest number of values in a label, and greatest length of a label in characters."""
-
-
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
     """Return a label for each scene. It is the scene's name if all names differ, or else the values in which the scenes
     differ, such as ``viscosity = 0.1 Pa s``. Return ``otherwise`` if no values or too many values differ."""
@@ -218,11 +187,9 @@ def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]
     names = short if len(set(short)) == len(keys) else keys
-    by_value = [
-        ", ".join(f"{name.replace('_', ' ')} = {_value(table, key)}" for name, key in zip(names, keys, strict=True))
-        for table in tables
-    ]
-    few = len(keys) <= MOST_KEYS and max(map(len, by_value)) <= LONGEST
+    named = [(name.replace("_", " "), key) for name, key in zip(names, keys, strict=True)]
+    by_value = [", ".join(f"{name} = {_value(table, key)}" for name, key in named) for table in tables]
+    few = len(keys) <= 3 and max(map(len, by_value)) <= 64
     for found in ([scene.name for scene in scenes], by_value if few else []):
         if len(set(found)) == len(scenes):
             return found

@@ -14,16 +14,14 @@ from cortado.scene.appearance import Finish
 from cortado.scene.scene import Scene
 
 Numbers = NDArray[np.int64]
-SAME = 1e-9
-"""Distance for merging two vertices, relative to the size of the mesh."""
 SHARP = 0.8
 """Cosine of the angle between two normals above which an edge is smooth."""
+FAR = 1e9
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """Merge coincident vertices. Return the vertices, the triangles that still have an area, and a mask of the
-    remaining triangles."""
-    whole = np.rint((vertices - vertices.min(axis=0)) / (SAME * np.ptp(vertices, axis=0).max()))
+    """Merge coincident vertices. Return vertices, triangles that still have an area, and a mask of these triangles."""
+    whole = np.rint((vertices - vertices.min(axis=0)) / (1e-9 * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
     has_area = (found[:, 0] != found[:, 1]) & (found[:, 1] != found[:, 2]) & (found[:, 2] != found[:, 0])
@@ -33,10 +31,6 @@ def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray
 def sides_of(corners: Numbers) -> Numbers:
     """Return the sides of triangles (t, 3) as pairs of vertices (3 t, 2)."""
     return corners[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
-
-
-def lengths_of(vertices: Points, sides: Numbers) -> Points:
-    return np.asarray(np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1))
 
 
 def across_of(vertices: Points, corners: Numbers) -> Points:
@@ -125,11 +119,6 @@ def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
     return both[:, 0].min(axis=0), both[:, 1].max(axis=0)
 
 
-SIDES = 48
-FLAT = 1.0 - 1e-9
-"""Cosine of the angle between two normals above which triangles count as coplanar."""
-
-
 def solid_outline(scene: Scene) -> Points:
     """Return the outlines of the solids of a scene at rest as line segments (k, 2, d) [m]."""
     lines = [own_lines(one) @ one.turn.T + one.position for one in shown_solids(scene)]
@@ -139,7 +128,7 @@ def solid_outline(scene: Scene) -> Points:
 def own_faces(shown: ShownSolid) -> Faces:
     """Return the faces of a solid relative to its middle, without rotation."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
-    return shown.shape.shown_faces(np.pi / SIDES * float(max(sizes.min(), 0.25 * sizes.max())))
+    return shown.shape.shown_faces(np.pi / 48 * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:
@@ -150,13 +139,12 @@ def own_lines(shown: ShownSolid) -> Points:
     points, corners, _ = merged(faces.vertices, faces.corners)
     cosines = cosines_of(points, corners)
     edges = np.unique(np.sort(sides_of(corners)[cosines.ravel() < SHARP], axis=1), axis=0)
-    is_round = bool(((cosines >= SHARP) & (cosines < FLAT)).any())
+    is_round = bool(((cosines >= SHARP) & (cosines < 1.0 - 1e-9)).any())  # coplanar
     return np.concatenate([points[edges], *(_cut_by_plane(points, corners, axis) for axis in range(3) if is_round)])
 
 
 def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
-    """Intersect triangles with the plane through the origin perpendicular to an axis. Return line segments (k, 2, 3)
-    [m]."""
+    """Cut triangles by the plane through the origin perpendicular to an axis, into line segments (k, 2, 3) [m]."""
     above = points[:, axis] >= 0.0
     crossing = corners[(above[corners] != above[corners[:, :1]]).any(axis=1)]
     start, end = points[sides_of(crossing)].transpose(1, 0, 2)
@@ -173,14 +161,29 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
     Each side is cut into 2^k equal parts no longer than ``longest`` [m], with the least k, so that adjacent triangles
     fit. New sides inside a triangle are at most longer by a factor of the square root of 2.
     """
-    parts = _parts(lengths_of(vertices, sides_of(corners)), longest).reshape(-1, 3)
+
+    def parts_of(sides: Numbers) -> Numbers:
+        lengths = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1)
+        return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
+
+    parts = parts_of(sides_of(corners)).reshape(-1, 3)
     thin = (parts.min(axis=1) == 1) & (np.sort(parts, axis=1)[:, 1] > 1)
-    found = [_halved(vertices, corners[~thin], np.flatnonzero(~thin), longest)]
+    given, halved, parents = vertices, corners[~thin], np.flatnonzero(~thin)
+    while len(halved):
+        sides, which = np.unique(np.sort(sides_of(halved), axis=1), axis=0, return_inverse=True)
+        is_long = parts_of(sides) > 1
+        if not is_long.any():
+            break
+        middles = np.full(len(sides), -1)
+        middles[is_long] = len(vertices) + np.arange(is_long.sum())
+        vertices = np.concatenate([vertices, vertices[sides[is_long]].mean(axis=1)])
+        halved, parents = _cut(halved, middles[which.reshape(-1, 3)], parents)
+    found = [(vertices, halved, parents)]
     turned = (np.argmin(parts, axis=1)[:, None] + np.arange(3)) % 3  # so that the short side is across the first corner
     corners, parts = (np.take_along_axis(one, turned, axis=1) for one in (corners, parts))
     for second, first in np.unique(parts[thin, 1:], axis=0):
         which = np.flatnonzero(thin & (parts[:, 1:] == (second, first)).all(axis=1))
-        found.append(_in_strips(vertices[corners[which]], which, first, second))
+        found.append(_in_strips(given[corners[which]], which, first, second))
     starts = np.cumsum([0, *(len(one) for one, _, _ in found)])
     joined = [numbers + start for (_, numbers, _), start in zip(found, starts, strict=False)]
     parents = np.concatenate([one for _, _, one in found])
@@ -188,26 +191,8 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
     return vertices, corners, parents[kept]
 
 
-def _parts(lengths: Points, longest: float) -> Numbers:
-    return 2 ** np.ceil(np.log2(np.maximum(lengths / longest, 1.0))).astype(np.int64)
-
-
-def _halved(vertices: Points, corners: Numbers, parents: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    while len(corners):
-        sides, which = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True)
-        is_long = _parts(lengths_of(vertices, sides), longest) > 1
-        if not is_long.any():
-            break
-        middles = np.full(len(sides), -1)
-        middles[is_long] = len(vertices) + np.arange(is_long.sum())
-        vertices = np.concatenate([vertices, vertices[sides[is_long]].mean(axis=1)])
-        corners, parents = _cut(corners, middles[which.reshape(-1, 3)], parents)
-    return vertices, corners, parents
-
-
 def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
-    """Cut triangles (t, 3) into parts. ``middles`` (t, 3) are new vertices on the sides opposite to each
-    corner, or -1."""
+    """Cut triangles (t, 3) at ``middles`` (t, 3), new vertices on the sides opposite to each corner, or -1."""
     count, found, own = (middles >= 0).sum(axis=1), [], []
 
     def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
@@ -243,11 +228,6 @@ def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> 
     return vertices.reshape(-1, 3), corners, np.repeat(parents, len(own))
 
 
-ROUNDS = 8
-"""Number of smoothing iterations for the light on round solids."""
-FAR = 1e9
-
-
 @dataclass(frozen=True)
 class SolidMesh:
     """A triangle mesh of solids in space. Seen from outside, the corners of a triangle run counterclockwise."""
@@ -259,8 +239,7 @@ class SolidMesh:
     triangles: Numbers
     """Indices of the points of each triangle (t, 3)."""
     from_edges: Points
-    """Distance of each corner (column) from each side (row) of a triangle (t, 3, 3) [m]. It is `FAR` for sides that are
-    not sharp edges."""
+    """Distance of each corner (column) from each side (row) of a triangle (t, 3, 3) [m], or `FAR` for smooth edges."""
 
     @classmethod
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
@@ -270,8 +249,14 @@ class SolidMesh:
         normals = _normals(corners, across)
         key = np.column_stack([corners.ravel(), np.rint(normals.reshape(-1, 3) * 1e4).astype(np.int64)])
         _, chosen, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
-        from_edges = _from_edges(flat_points, flat_corners, points[corners], parents)
-        return cls(points[corners.ravel()[chosen]], normals.reshape(-1, 3)[chosen], number.reshape(-1, 3), from_edges)
+        sides = flat_points[sides_of(flat_corners).reshape(-1, 3, 2)]
+        flat = unit(across_of(flat_points, flat_corners))
+        inwards = unit(np.cross(flat[:, None], sides[:, :, 1] - sides[:, :, 0]))
+        beyond = points[corners][:, None] - sides[parents][:, :, :1]
+        distances = np.einsum("pkjc,pkc->pkj", beyond, inwards[parents])
+        is_sharp = (cosines_of(flat_points, flat_corners) < SHARP)[parents][..., None]
+        places, whole = points[corners.ravel()[chosen]], normals.reshape(-1, 3)[chosen]
+        return cls(places, whole, number.reshape(-1, 3), np.where(is_sharp, distances, FAR))
 
     def smoothed(self, values: Points) -> Points:
         """Smooth values at points (p, c) along the surface, but not across sharp edges."""
@@ -282,7 +267,7 @@ class SolidMesh:
         count = len(self.points)
         beside = csr_matrix((np.ones(len(first)), (first, second)), (count, count))
         weights = np.maximum(np.asarray(beside.sum(axis=1)), 1.0)
-        for _ in range(ROUNDS):
+        for _ in range(8):
             values = 0.5 * values + 0.5 * (beside @ values) / weights
         return values
 
@@ -292,17 +277,13 @@ class SolidMesh:
     @classmethod
     def joined(cls, parts: Sequence["SolidMesh"]) -> "SolidMesh":
         starts = np.cumsum([0, *(len(part.points) for part in parts)])
-        return cls(
-            points=np.concatenate([part.points for part in parts]),
-            normals=np.concatenate([part.normals for part in parts]),
-            triangles=np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
-            from_edges=np.concatenate([part.from_edges for part in parts]),
-        )
+        triangles = np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)])
+        points, normals = (np.concatenate([getattr(one, name) for one in parts]) for name in ("points", "normals"))
+        return cls(points, normals, triangles, np.concatenate([part.from_edges for part in parts]))
 
 
 def _normals(corners: Numbers, across: Points) -> Points:
-    """Return the mean normal of the adjacent triangles at each corner (t, 3, 3). Triangles beyond sharp edges do not
-    count."""
+    """Return the mean normal of the triangles around each corner (t, 3, 3), without those beyond sharp edges."""
     order = np.argsort(corners.ravel(), kind="stable")
     counts = np.bincount(corners.ravel())
     ends = np.cumsum(counts)
@@ -315,12 +296,3 @@ def _normals(corners: Numbers, across: Points) -> Points:
     weighted = across[other] * smooth[:, None]
     summed = np.stack([np.bincount(corner, weighted[:, k], corners.size) for k in range(3)], axis=1)
     return unit(summed).reshape(-1, 3, 3)
-
-
-def _from_edges(points: Points, corners: Numbers, parts: Points, parents: Numbers) -> Points:
-    sides = points[sides_of(corners).reshape(-1, 3, 2)]
-    across = unit(across_of(points, corners))
-    inwards = unit(np.cross(across[:, None], sides[:, :, 1] - sides[:, :, 0]))
-    beyond = parts[:, None] - sides[parents][:, :, :1]
-    distances = np.einsum("pkjc,pkc->pkj", beyond, inwards[parents])
-    return np.where((cosines_of(points, corners) < SHARP)[parents][..., None], distances, FAR)

@@ -14,15 +14,14 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, CylinderContainer
 
 DROPS = 0.002
-SPILT, BEYOND = 0.1, 0.15
-NEAR = 0.25
-"""Distance from the first state within which every drop is shown, relative to the size of the first state."""
 ENOUGH = 1_000_000
 """Number of sampled positions that determine the extent of the fluid."""
-
-
 Box = tuple[Points, Points]
 """Two points (d,) [m], such as two corners."""
+TINT = 2.6
+"""Ratio of absorption to scattering for fluids without a material."""
+SPAN = 0.1
+"""Thickness of fluid in the definition of transparency, relative to the size of the contents."""
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
@@ -41,10 +40,10 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
     first, *later = states
     found = [_ends(first, DROPS)]
     lower, upper = union([*found, *around])
-    near = NEAR * float(np.max(upper - lower))
+    near = 0.25 * float(np.max(upper - lower))
     for state in later:
-        low, high = _ends(state, SPILT)
-        beyond = BEYOND * (high - low)
+        low, high = _ends(state, 0.1)  # the bulk
+        beyond = 0.15 * (high - low)
         found.append((np.maximum(low - beyond, state.min(axis=0)), np.minimum(high + beyond, state.max(axis=0))))
         close = state[((state > lower - near) & (state < upper + near)).all(axis=1)]
         found += [_ends(close, DROPS)] if len(close) else []
@@ -52,18 +51,9 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return the lower and the upper corner (d,) [m] of positions (n, d) [m], without the outermost fraction ``share``
-    along each axis."""
+    """Return the corners (d,) [m] of positions (n, d) [m], without the outermost ``share`` along each axis."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
-
-
-TINT = 2.6
-"""Ratio of absorption to scattering for fluids without a material."""
-SPAN = 0.1
-"""Thickness of fluid in the definition of transparency, relative to the size of the contents."""
-LAYERS, LAYERS_OF_SPHERES = 3.0, 1e3
-"""Number of scattering events within one spacing of opaque fluid, and of spheres."""
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
@@ -79,9 +69,9 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
     liquids = [LIQUIDS[phase.material] if own and phase.material else None for phase in scene.phase]
     if transparency is None:
         transparency = 0.0 if len(scene.phase) > 1 or not by_phase else 0.9
-    plain = LAYERS / spacing
+    plain = 3.0 / spacing  # events of scattering within a spacing
     if picture.surface == "spheres":
-        plain = LAYERS_OF_SPHERES / spacing
+        plain = 1e3 / spacing
     elif transparency > 0.0:
         plain = min(-np.log(transparency) / (SPAN * size), plain)
     media = [(one.scattering, one.absorption) if one else (plain, TINT * plain) for one in liquids]
@@ -93,21 +83,9 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
     return np.array(media), float(np.mean(through))
 
 
-MARGIN = 1.10
-"""Ratio of the width of a picture to the width of its contents."""
-AROUND = 1.08
-AIR = 0.1
-"""Space beside fluid without a container, relative to the width of the fluid."""
-FROM_ABOVE, FROM_THE_SIDE = 40.0, 16.0
-"""Elevation of the camera above an opaque cup, and in front of any other scene [degrees]."""
-AZIMUTH = 24.0
-"""Azimuth of the camera, positive to the right [degrees]."""
-
-
 @dataclass(frozen=True)
 class Stage:
-    """The surroundings of the fluid in picture axes. The y axis points up, and the origin is in the middle of the
-    contents."""
+    """The surroundings of the fluid in picture axes: y points up, and the origin is in the middle of the contents."""
 
     frame: Points
     """Rotation from the axes of the scene to picture axes (3, 3)."""
@@ -148,7 +126,7 @@ class Stage:
         lower, upper = fluid_extent(states, around)
         frame = upright(np.asarray(scene.forces.gravity))
         if ends is None:
-            air = 0.5 * scene.discretisation.spacing + AIR * (1.0 - np.abs(frame[1])) * (upper - lower)
+            air = 0.5 * scene.discretisation.spacing + 0.1 * (1.0 - np.abs(frame[1])) * (upper - lower)
             air = 0.0 * air if any(table.side == "inside" for table in scene.solid) else air
             lower, upper = union([(lower - air, upper + air), *around])
         else:
@@ -158,7 +136,7 @@ class Stage:
         from_above = len(scene.phase) > 1 and (scene.render is None or scene.render.view == "top")
         into_cup = from_above and isinstance(scene.container, CylinderContainer)
         into_cup |= any(table.shape == "cup" and not table.transparency for table in scene.solid)
-        elevation = FROM_ABOVE if into_cup else FROM_THE_SIDE
+        elevation = 40.0 if into_cup else 16.0  # degrees
         media, transparency = media_of(scene, float((high - low).max()))
         spacing = scene.discretisation.spacing
         cuts = ends is not None and not spilled(scene.container, np.concatenate(states), spacing)
@@ -167,8 +145,7 @@ class Stage:
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """Return the stage for a picture of a new size. The camera sees everything between the corners ``ends`` (3,)
-        [m] in the axes of the scene."""
+        """Return the stage for a new picture, which shows all between the corners ``ends`` (3,) [m] of the scene."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
         if picture.look_at is not None:
@@ -195,14 +172,13 @@ class Stage:
 
     @property
     def home_around(self) -> View:
-        """First view of an orbiting camera, which sees all contents from every side. If [picture] sets the position of
-        the camera, the view starts there."""
+        """First view of an orbiting camera, which sees everything from every side, or [picture]'s own camera."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
         elevation = float(np.degrees(np.arcsin(back[1] / np.linalg.norm(back))))
         sides = (fitted(*self.seen, elevation, self.picture, turn) for turn in np.arange(0.0, 180.0, 15.0))
-        off = AROUND * max(float(np.linalg.norm(eye - look_at)) for eye, look_at in sides)
+        off = 1.08 * max(float(np.linalg.norm(eye - look_at)) for eye, look_at in sides)
         eye = middle + off * back / np.linalg.norm(back)
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
@@ -227,17 +203,12 @@ class Stage:
         """Greatest side of the contents [m]."""
         return float((self.upper - self.lower).max())
 
-    @property
-    def clearness(self) -> float:
-        return 0.85 * self.transparency
-
     def placed(self, positions: Points) -> Points:
         """Convert positions (n, 3) [m] from the axes of the scene to picture axes."""
         return (positions - self.origin) @ self.frame.T
 
     def on_screen(self, points: Points) -> Points:
-        """Return the column and row in the picture (n, 2) of points of the scene (n, 3) [m], in pixels from the upper
-        left corner."""
+        """Return column and row in the picture (n, 2) of points of the scene (n, 3) [m], from the upper left corner."""
         forward = self.look_at - self.eye
         forward = forward / np.linalg.norm(forward)
         off = self.placed(points) - self.eye
@@ -279,8 +250,7 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """Mask (2, 3) of the sides of a box that are panes of glass. Rows are lower and upper ends, and columns are
-        axes."""
+        """Mask (2, 3) of the sides of a box that are panes of glass: lower and upper ends, for each axis."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -326,11 +296,10 @@ def _towards(azimuth: float, elevation: float) -> Points:
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = AZIMUTH) -> Box:
-    """Return the position of the camera (3,) [m] and the point in the middle of its view (3,) [m], so that a box fills
-    the picture."""
+def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = 24.0) -> Box:
+    """Return the camera's position (3,) [m] and the middle of its view (3,) [m], so that a box fills the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
-    half = np.tan(0.5 * np.radians(picture.field_of_view)) / MARGIN
+    half = np.tan(0.5 * np.radians(picture.field_of_view)) / 1.10
     halves = half, half * picture.height / picture.width
     right, up = screen_axes(-back)
     look_at, distance = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower)) / halves[1]
@@ -345,8 +314,7 @@ def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azi
 
 
 def screen_axes(forward: Points) -> tuple[Points, Points]:
-    """Return the unit vectors (3,) to the right and upwards on the screen, for the viewing direction
-    ``forward`` (3,)."""
+    """Return the unit vectors (3,) to the right and upwards on the screen, seen along ``forward`` (3,)."""
     helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 * np.linalg.norm(forward) else np.array([0, 0, -1.0])
     right = np.cross(forward, helper)
     right /= np.linalg.norm(right)

@@ -36,19 +36,8 @@ from cortado.scene.solids import SolidTable
 SAME = 1e-9
 """Tolerance of the time of a frame, in frame intervals."""
 FRACTION = "mass_fraction_"
-SHORTEST, LONGEST = 4.0, 10.0
-"""Shortest and longest film by default [s]."""
-FEW = 1.0
-"""Length of a film with few frames [s]."""
 SLOWEST, USUAL = 6.0, 25.0
 """Smallest and usual number of frames per second of a film."""
-SMOOTH = 12.0
-SHORT = 1.5
-EARLY = 1e-6
-"""Tolerance for the time of the last frame, in frame intervals."""
-EASY = (5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)
-
-
 Fields = Mapping[str, NDArray[Any]]
 Times = Sequence[float] | NDArray
 
@@ -70,8 +59,7 @@ class Marks:
         return self.start + np.asarray(numbers) / self.rate
 
     def due(self, times: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the due times (frames,) [s] of frames recorded at ``times`` (frames,) [s]. After skipped due times,
-        the recorded times are returned."""
+        """Return the due times (frames,) [s] of frames at ``times`` (frames,) [s], or ``times`` after skipped ones."""
         numbers = self.passed(times)
         one_by_one = np.diff(numbers, prepend=numbers[:1] - 1) == 1
         return np.where(one_by_one, self.at(numbers), times)
@@ -120,8 +108,7 @@ def frame_writer(
 def append_frame(
     writer: vtkhdf.TrajectoryWriter, frame: Fields, step: int, quantities: Fields, time: float | None = None
 ) -> None:
-    """Write the frame after ``step`` steps. By default, its time is the time that `frame_writer` was given. ``time``
-    [s] replaces it."""
+    """Write the frame after ``step`` steps, at ``time`` [s] or at the time that `frame_writer` was given."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
     scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **quantities}
     writer.append(frame["positions"], frame["velocities"], step=step, time=time, others=_others(frame), **scalars)
@@ -159,15 +146,19 @@ class Pace:
         """
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
-        if speed is None:
-            speed = _speed(span, min(count or len(times), len(times)), full if count is None else 0.0)
+        if speed is None and span <= 0.0:
+            speed = 1.0
+        elif speed is None:
+            shown, easy = min(count or len(times), len(times)), full if count is None else 0.0
+            room = max((shown - 1) / USUAL, min(1.0, shown / SLOWEST))
+            speed = easy if span <= 1.01 * room * easy else float(f"{span / room:.2g}")
         most = min(count or round(USUAL * span / speed) + 1, len(times))
-        enough = USUAL / full
         chosen = np.unique(np.rint(np.linspace(0, len(times) - 1, most)).astype(int)).tolist()
         if rate is not None and count is None:
-            chosen = list(range(0, _whole(times, rate), max(round(rate * speed / USUAL), 1)))
-        shown = tuple((times[k] - times[0]) / speed for k in chosen)
-        return cls(tuple(chosen), shown, speed, len(times), enough, is_asked)
+            is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - 1e-6  # the last one
+            chosen = list(range(0, len(times) - int(is_early), max(round(rate * speed / USUAL), 1)))
+        in_film = tuple((times[k] - times[0]) / speed for k in chosen)
+        return cls(tuple(chosen), in_film, speed, len(times), USUAL / full, is_asked)
 
     @property
     def frames_per_second(self) -> float:
@@ -181,26 +172,19 @@ class Pace:
     def seconds(self) -> float:
         return self.times[-1] + 1.0 / self.frames_per_second
 
-    @property
-    def _more(self) -> str:
-        if self.of_search:
-            return f"picture.film_frames={self.enough * self._span + 1.0:.0f}"
-        return f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
-
     def __str__(self) -> str:
         left_out = self.recorded - len(self.frames)
         kept = f"{counted(len(self.frames), 'frame')}, {self.seconds:.1f} s, {self.in_words}"
         if left_out:
             kept += f"; {left_out} of the {self.recorded} that were recorded are left out"
-        lacks = self.frames_per_second < SMOOTH or self.speed > SHORT * USUAL / self.enough
+        lacks = self.frames_per_second < 12.0 or self.speed > 1.5 * USUAL / self.enough
         if 1 < len(self.frames) == self.recorded and lacks:
-            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: {self._more} "
-            kept += f"records {USUAL:g} for each second of a film of {self.enough * self._span / USUAL:.2g} s"
+            wanted = self.enough * (self.times[-1] * self.speed)
+            more = f"--fps {self.enough:.4g}" if self.enough < 1e3 else f"--fps {self.enough:.0f}"
+            more = f"picture.film_frames={wanted + 1.0:.0f}" if self.of_search else more
+            kept += f", with {self.frames_per_second:.2g} frames a second, as no more were recorded: {more} "
+            kept += f"records {USUAL:g} for each second of a film of {wanted / USUAL:.2g} s"
         return kept if self.is_asked or self.speed == 1.0 else f"{kept}; picture.film_speed=1 is real time"
-
-    @property
-    def _span(self) -> float:
-        return self.times[-1] * self.speed
 
 
 @dataclass(frozen=True)
@@ -224,8 +208,7 @@ class Film:
 
 
 def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
-    """Return the pace for frames at ``times`` [s] from the table [picture]. Warn if the table asks for more frames than
-    were recorded."""
+    """Return the pace for frames at ``times`` [s] from [picture]. Warn if it asks for more frames than there are."""
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
@@ -234,25 +217,12 @@ def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
     return Pace.of(times, asked, picture.film_speed, rate)
 
 
-def _whole(times: Times, rate: float) -> int:
-    is_early = len(times) > 2 and (times[-1] - times[-2]) * rate < 1.0 - EARLY
-    return len(times) - 1 if is_early else len(times)
-
-
-def _speed(span: float, count: int, easy: float) -> float:
-    """Return the speed of a film of at most ``count`` frames over ``span`` [s]. It is at least ``easy``."""
-    if span <= 0.0:
-        return 1.0
-    room = max((count - 1) / USUAL, min(FEW, count / SLOWEST))
-    return easy if span <= 1.01 * room * easy else float(f"{span / room:.2g}")
-
-
 def _easy_speed(span: float) -> float:
-    wanted = span / min(max(span, SHORTEST), LONGEST)
+    wanted = span / min(max(span, 4.0), 10.0)  # s, the shortest and the longest film
     if wanted <= 0.0:
         return 1.0
     power = 10.0 ** floor(log10(wanted) + 1e-9)
-    speeds = [round(easy * power, 12) for easy in (10.0, *EASY)]
+    speeds = [round(easy * power, 12) for easy in (10.0, 5.0, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)]
     if wanted > 1.0:
         return min(speed for speed in speeds if speed >= wanted * (1.0 - 1e-9))
     return max(speed for speed in speeds if speed <= wanted * (1.0 + 1e-9))
@@ -276,8 +246,15 @@ class SolidMotion:
         position, begun = (fields[of(name)][:, 0].astype(np.float64) for of in (position_name, rotation_name))
         if f"{name}.{AXES[0]}" in fields:  # of a body that is free
             axes = np.stack([fields[f"{name}.{axis}"][:, 0].astype(np.float64) for axis in AXES], axis=-1)
+            axes += np.eye(dimension, 3)
+            if dimension == 2:
+                rotations = np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])) + begun
+            else:
+                from scipy.spatial.transform import Rotation
+
+                rotations = _product(Rotation.from_matrix(axes).as_rotvec(), begun)
             velocities, spins = (fields[of(name)][:, 0] for of in (velocity_name, angular_velocity_name))
-            return cls(position, _turned(axes + np.eye(dimension, 3), begun, dimension), velocities, spins)
+            return cls(position, rotations, velocities, spins)
         turns = fields[turn_name(name)][:, 0].astype(np.float64)
         rotations = turns + begun if dimension == 2 else _product(turns, begun)
         return cls(position, rotations, scale=float([*fields[scale_name(name)][:, 0], 1.0][0]))
@@ -328,21 +305,10 @@ class SolidMotions(dict[str, SolidMotion]):
         shifts, tables = times - known[recorded], {table.name: table for table in told(scene.solid)}
         if not shifts.any():
             return SolidMotions({name: motion[recorded] for name, motion in self.items()})
-        return SolidMotions(
-            {
-                name: motion.between(known, times, tables[name]) if name in tables else motion[recorded].carried(shifts)
-                for name, motion in self.items()
-                if name in tables or motion.velocities is not None
-            }
-        )
-
-
-def _turned(axes: NDArray[Any], begun: NDArray[Any], dimension: int) -> NDArray[Any]:
-    if dimension == 2:
-        return np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])) + begun
-    from scipy.spatial.transform import Rotation
-
-    return _product(Rotation.from_matrix(axes).as_rotvec(), begun)
+        moved = {name: own[recorded].carried(shifts) for name, own in self.items() if own.velocities is not None}
+        by_path = {name: self[name].between(known, times, tables[name]) for name in self if name in tables}
+        found = moved | by_path
+        return SolidMotions({name: found[name] for name in self if name in found})
 
 
 def _product(turns: NDArray[Any], begun: NDArray[Any]) -> NDArray[Any]:

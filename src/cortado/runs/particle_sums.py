@@ -23,6 +23,12 @@ from cortado.scene.motions import Pose, position_name
 from cortado.scene.solids import SolidTable
 
 Axes = Literal["world", "body"]
+ACROSS = {1: 1.5, 2: 7.0 / np.pi}
+"""Normalisation factor of the weights, by dimension."""
+LEAST_REACH = 5.0
+"""Least reach of the weights for an accuracy of 0.1 % [spacings]."""
+Across = Callable[[NDArray[Any]], NDArray[Any]]
+"""A linear function from vectors (n, d) to vectors (n, k), such as a projection onto a plane."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +43,8 @@ class Ride:
             names = f", of {', '.join(map(shown, moving))}" if moving else "; the scene has none"
             raise InputError(f"A sensor is on {shown(self.on)}, but must be on a solid that moves{names}.")
         if self.turns and any(at.lattice.domain.lengths):
-            raise InputError(
-                f"A view that turns with the solid {shown(self.on)} has no images along periodic axes: give a sensor "
-                'on it the axes "world", or read a solid_load.'
-            )
+            found = f"A view that turns with the solid {shown(self.on)} has no images along periodic axes"
+            raise InputError(f'{found}: give a sensor on it the axes "world", or read a solid_load.')
         return moving[self.on]
 
     def carrier(self, at: Reading) -> "Carrier":
@@ -70,18 +74,15 @@ class Carrier:
         return in_space(points - self.pose.position)
 
     def bars(self, shift: NDArray[Any], twist: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert derivatives with respect to a translation (d,) and a small rotation (3,) to adjoints of
-        state fields."""
+        """Convert derivatives along a translation (d,) and a small rotation (3,) to adjoints of state fields."""
         return {position_name(self.pose.name): shift[None]} | self.pose.turning_bars(twist)
 
     def lifted(self, bar: NDArray[Any], point: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert the derivative ``bar`` (d,) with respect to the current place of ``point`` (d,) to adjoints of state
-        fields."""
+        """Convert the derivative ``bar`` (d,) along the current place of ``point`` (d,) to adjoints of state fields."""
         return self.bars(bar, np.cross(self.arms(self.place(point)), in_space(bar)))
 
     def carried(self, bars: NDArray[Any], points: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Convert derivatives (n, d) with respect to points (n, d) in the frame of the solid to adjoints of state
-        fields."""
+        """Convert derivatives (n, d) along points (n, d) in the frame of the solid to adjoints of state fields."""
         return self.bars(-bars.sum(axis=0), -np.cross(self.arms(points), in_space(bars)).sum(axis=0))
 
 
@@ -109,8 +110,7 @@ def together(*each: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def axes_of(axes: Any, is_carried: bool) -> Axes:
-    """Return the axes of a sensor, "world" or "body". Raises `InputError` for other values, and for "body" without a
-    solid."""
+    """Return the axes of a sensor, "world" or "body". Raises `InputError` for others, or "body" without a solid."""
     if not isinstance(axes, str) or axes not in ("world", "body"):
         raise InputError(f'axes is {shown(axes)}, but must be "world" or "body".')
     if axes == "body" and not is_carried:
@@ -118,22 +118,11 @@ def axes_of(axes: Any, is_carried: bool) -> Axes:
     return "body" if axes == "body" else "world"
 
 
-ACROSS = {1: 1.5, 2: 7.0 / np.pi}
-"""Normalisation factor of the weights, by dimension."""
-LEAST_REACH = 5.0
-"""Least reach of the weights for an accuracy of 0.1 % [spacings]."""
-MOST_PARTS = 40
-
-
 def weights_of(q: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the weights w(q) = (1 - q)^4 (1 + 4 q), which are 0 for q > 1, and the derivatives w'(q) / q (Wendland
     1995). q is the distance divided by the reach."""
     rest = np.clip(1.0 - q, 0.0, None)
     return rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3
-
-
-Across = Callable[[NDArray[Any]], NDArray[Any]]
-"""A linear function from vectors (n, d) to vectors (n, k), such as a projection onto a plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,8 +194,7 @@ class Seen:
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """Convert derivatives with respect to the weights (n,) to derivatives with respect to the vectors from the
-        place to the particles (n, k)."""
+        """Convert derivatives along weights (n,) to those along the vectors from the place to the particles (n, k)."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
             found[image.near] += (each[image.near] * image.slopes / self.reach**2)[:, None] * image.ways
@@ -225,7 +213,7 @@ def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
     Particles are divided along ``axes`` axes, so that the weights on the rest lattice add up to 1.
     """
     spacing = at.lattice.cell ** (1.0 / at.dimension)
-    count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), MOST_PARTS)
+    count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), 40)  # parts at most
     best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
     along = spacing * ((np.arange(count) + 0.5) / count - 0.5)
     return grid([along if axis in best else np.zeros(1) for axis in range(at.dimension)])
@@ -264,8 +252,7 @@ class LoadSensor(Summed):
 
 @dataclass(frozen=True, eq=False)
 class WeightedSum:
-    """Weighted sums over the particles around a place: the sum of the weights, and the sum of the weights times a
-    quantity or a velocity component."""
+    """Sums around a place: of the weights, and of the weights times a quantity or a velocity component."""
 
     around: Around
     quantity: str | None = None
@@ -302,8 +289,7 @@ class RegionSum:
         return np.concatenate([force.sum(axis=0), np.cross(arms, force).sum(axis=0)])
 
     def chosen(self, at: Reading) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the vectors (n, d) from ``about`` to the particles, and the forces (n, d). Forces outside the box are
-        0."""
+        """Return vectors (n, d) from ``about`` to the particles, and forces (n, d), which are 0 outside the box."""
         if self.ride is not None:
             carrier, force = self.ride.carrier(at), at["wall_force"]
             arms = (at["positions"] - carrier.place(self.about)) @ carrier.flat

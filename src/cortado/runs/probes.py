@@ -1,5 +1,4 @@
-"""Sensors of pressure, flow rate and loads, the sensors of a scene, and warnings about sensors out of reach of the
-fluid."""
+"""Sensors of pressure, flow rate and loads, the sensors of a scene, and warnings about those out of reach."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -15,7 +14,6 @@ from cortado.runs.particle_sums import (
     ACROSS,
     Around,
     Axes,
-    Carrier,
     LoadSensor,
     LoadSum,
     RegionSum,
@@ -47,6 +45,8 @@ from cortado.runs.sensor import (
 from cortado.runs.wave_gauge import WaveGauge
 from cortado.scene.parameters import load_name
 from cortado.scene.scene import Scene
+
+MOST = 16
 
 
 @fixed
@@ -113,9 +113,8 @@ class FlowRate(Summed):
         """
         self.position, self.normal = point("position", position), direction("normal", normal)
         if len(self.position) != len(self.normal):
-            raise InputError(
-                f"normal has {len(self.normal)} components, but must have {len(self.position)}, as position has."
-            )
+            wanted = f"must have {len(self.position)}, as position has"
+            raise InputError(f"normal has {len(self.normal)} components, but {wanted}.")
         self.reach = None if reach is None else positive("reach", reach)
 
     def columns(self, dimension: int) -> dict[str, str]:
@@ -237,19 +236,18 @@ class SolidLoad(LoadSensor):
         return LoadSum(load_name(self.solid))
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        return super().reading(at, found if self.axes == "world" else turned(found, self._carrier(at).turn.T))
+        if self.axes == "body":
+            found = turned(found, Ride(self.solid, False).carrier(at).turn.T)
+        return super().reading(at, found)
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
         name, d = load_name(self.solid), at.dimension
         if self.axes == "world":
             return {name: bar}
-        carrier, found = self._carrier(at), self.summed(at).on_host(at)
+        carrier, found = Ride(self.solid, False).carrier(at), self.summed(at).on_host(at)
         world = turned(np.concatenate(load_bars(bar, d)), carrier.turn)
         twist = -np.cross(found.reshape(2, 3), world.reshape(2, 3)).sum(axis=0)
         return carrier.bars(np.zeros(d), twist) | {name: in_the_scene(world, d)}
-
-    def _carrier(self, at: Reading) -> Carrier:
-        return Ride(self.solid, False).carrier(at)
 
 
 SENSORS: dict[str, Callable[..., Sensor]] = {
@@ -266,16 +264,8 @@ SENSORS: dict[str, Callable[..., Sensor]] = {
 def sensors_of(scene: Scene) -> dict[str, Sensor]:
     gravity = np.asarray(scene.forces.gravity, dtype=np.float64)
     upwards: dict[str, Any] = {"wave_gauge": {"up": -gravity}} if gravity.any() else {}
-    return {
-        table.name: SENSORS[table.kind](**table.model_dump(exclude={"name", "kind"}), **upwards.get(table.kind, {}))
-        for table in scene.sensor
-    }
-
-
-MOST_CELLS = 200_000
-"""Greatest number of cells for the search. Larger containers are not checked."""
-DEEP = 0.01
-"""Depth inside a solid for points that count as on the surface [spacings]."""
+    given = {table.name: (table.kind, table.model_dump(exclude={"name", "kind"})) for table in scene.sensor}
+    return {name: SENSORS[kind](**values, **upwards.get(kind, {})) for name, (kind, values) in given.items()}
 
 
 def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_]:
@@ -289,7 +279,7 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
         return nowhere
     lower, upper = np.array(ends, dtype=np.float64)
     counts = np.maximum(np.ceil((upper - lower) / (0.5 * scene.discretisation.spacing)), 1.0)
-    if np.prod(counts) > MOST_CELLS:
+    if np.prod(counts) > 200_000:  # larger containers are not searched
         return nowhere
     shape, cells = tuple(counts.astype(int)), (upper - lower) / counts
     middles = lower + (np.indices(shape).reshape(len(shape), -1).T + 0.5) * cells
@@ -301,9 +291,6 @@ def is_shut_off(scene: Scene, fluid: Points, points: Points) -> NDArray[np.bool_
 
     found = named(points)
     return (found > 0) & ~np.isin(found, named(fluid))
-
-
-MOST = 16
 
 
 class Prepared(Cut, Protocol):
@@ -328,21 +315,26 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     place = sensor.position
     if len(place) != scene.dimension:
         return None  # refused where it is read
-    there = _what_is_at(simulation, _looked_at(scene.container.extent() or _of_things(simulation), sensor))
+    ends = scene.container.extent()
+    there = _what_is_at(simulation, _looked_at(ends or _of_things(simulation), sensor))
     key = "reach" if isinstance(sensor, FlowRate) else "radius"
     if all(there):
         what = {PressureProbe: "is at", WaveGauge: "has its column at", FlowRate: "has its plane through"}[type(sensor)]
         reads = f"its floor, {sensor.floor:g} m" if isinstance(sensor, WaveGauge) else "0"
-        ends = scene.container.extent()
         is_far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
         reads += f", or what is within its {key}{' (positions are in metres)' if is_far else ''}"
         return f"{what} {point_in_words(place)} m, {' and '.join(dict.fromkeys(filter(None, there)))}: it reads {reads}"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
         return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
-    if scene.container.extent() is None:
+    if ends is None:
         return _far_away(simulation, sensor, reach_of(wide, simulation))
-    return _of_column(simulation, sensor) if isinstance(sensor, WaveGauge) else _too_wide(scene, key, wide)
+    if isinstance(sensor, WaveGauge) and (said := _of_column(scene, ends, sensor)):
+        return said
+    size = float(np.linalg.norm(np.subtract(*ends)))
+    if wide is None or wide <= size or any(scene.periods[1]):
+        return None
+    return f"has a {key} of {wide:g} m, more than the container, which is {size:g} m across: it reads no place in it"
 
 
 def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
@@ -364,9 +356,7 @@ def _of_things(simulation: Prepared) -> tuple[Points, Points]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
-    scene, ends = simulation.scene, simulation.scene.container.extent()
-    assert ends is not None
+def _of_column(scene: Scene, ends: tuple[Points, Points], gauge: WaveGauge) -> str | None:
     heights = corners(*ends) @ gauge.up
     bottom, top = float(heights.min()), float(heights.max())
     if gauge.floor > top:
@@ -377,17 +367,7 @@ def _of_column(simulation: Prepared, gauge: WaveGauge) -> str | None:
     if abs(gauge.floor - bottom) > near and not stands:
         reads = f"{abs(gauge.floor - bottom):g} m {'more' if gauge.floor > bottom else 'less'} than the level"
         return f"has its floor at {gauge.floor:g} m, but the container begins at {bottom:g} m: it reads {reads} there"
-    return _too_wide(scene, "radius", gauge.radius)
-
-
-def _too_wide(scene: Scene, key: str, wide: float | None) -> str | None:
-    ends = scene.container.extent()
-    if wide is None or ends is None or any(scene.periods[1]):
-        return None
-    size = float(np.linalg.norm(np.subtract(*ends)))
-    if wide <= size:
-        return None
-    return f"has a {key} of {wide:g} m, more than the container, which is {size:g} m across: it reads no place in it"
+    return None
 
 
 def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
@@ -408,7 +388,7 @@ def _looked_at(ends: tuple[Points, Points], sensor: Any) -> Points:
 
 def _what_is_at(simulation: Prepared, points: Points) -> list[str | None]:
     scene = simulation.scene
-    d, deep = scene.dimension, DEEP * scene.discretisation.spacing
+    d, deep = scene.dimension, 0.01 * scene.discretisation.spacing  # less deep is on the surface
     region, ends = scene.container.region(d).opened(scene.container.periods(d)[1]), scene.container.extent()
     found: list[str | None] = [None] * len(points)
     if ends is not None:

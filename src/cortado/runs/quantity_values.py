@@ -28,6 +28,8 @@ from cortado.solvers.solver import Counts, Solver, WithinBar
 from cortado.sph.parts import StepContext, sort
 
 Given = Mapping[str, NDArray]
+Evaluator = Callable[[], "QuantityEvaluator"]
+STRESS = "pressure"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class Moment:
     substeps: int
     row: int
     """Number of the step in its run, from 0. For the last state it is the number of steps."""
-    evaluator: Callable[[], "QuantityEvaluator"]
+    evaluator: "Evaluator"
     wanted: set[str] = field(default_factory=set)
     """Names of the quantities that were read so far. All moments of a run share this set."""
     counts: list[Counts] = field(default_factory=list)
@@ -49,12 +51,7 @@ class Moment:
 
     @classmethod
     def of(
-        cls,
-        rollout: Rollout,
-        step: int,
-        state: State,
-        evaluator: Callable[[], "QuantityEvaluator"],
-        wanted: set[str] | None = None,
+        cls, rollout: Rollout, step: int, state: State, evaluator: "Evaluator", wanted: set[str] | None = None
     ) -> "Moment":
         """Make the moment after ``step`` steps of a rollout."""
         parameters = row_of(rollout, rollout.parameters.written, step)
@@ -84,13 +81,9 @@ class Moment:
         return self.evaluator().tangents(names, self, dot, parameters_dot)
 
 
-STRESS = "pressure"
-OF_PRESSURE = {STRESS, "wall_force"}
-"""Quantities that depend on the pressure in the step."""
-
-
 def _needs_the_step(name: str) -> bool:
-    return name in OF_PRESSURE or is_load(name)
+    """Test if a quantity depends on the pressure in the step."""
+    return name in (STRESS, "wall_force") or is_load(name)
 
 
 class QuantityEvaluator:
@@ -311,8 +304,7 @@ def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
 
 
 def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
-    """Add the adjoint of a parameter in one time step to the adjoint ``total`` of all time steps. This is the transpose
-    of `row_of`."""
+    """Add the adjoint of a parameter in one time step to its ``total`` over all steps, the transpose of `row_of`."""
     shares = _shares_of_rows(rollout, name, row, total)
     if shares is None:
         total += bar
@@ -322,8 +314,7 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return the weights of time steps in the value of `row_of`, by step number, or None for a parameter that is
-    constant in time."""
+    """Return the weights of time steps in the value of `row_of`, by step, or None for one constant in time."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None

@@ -27,6 +27,9 @@ from cortado.scene.parameters import Axis
 from cortado.scene.restart import Clock
 from cortado.scene.scene import Scene
 
+MOST = 2**28
+"""Greatest size of copied states that are not yet read [bytes]."""
+
 
 @dataclass(frozen=True)
 class EverySteps:
@@ -41,8 +44,7 @@ class EverySteps:
         return {"record_every": self.steps}
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Test if the state after ``step`` steps is recorded. ``now`` is its time [s], and ``before`` the time of the
-        previous state [s]."""
+        """Test if the state after ``step`` steps, at the time ``now`` [s] and after ``before`` [s], is recorded."""
         return step % self.steps == 0
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
@@ -55,8 +57,7 @@ class EverySteps:
         return expected_frames(rollout, self.steps)
 
     def count(self, steps: int, time: float | None) -> int:
-        """Return the number of frames in ``steps`` equal steps over ``time`` [s], or None if a needed time is
-        missing."""
+        """Return the number of frames in ``steps`` equal steps over ``time`` [s], or None without a needed time."""
         return 1 + -(-steps // self.steps)
 
 
@@ -104,8 +105,7 @@ class TrajectoryBatch(Sequence[Trajectory]):
 
     trajectories: tuple[Trajectory, ...]
     fields: Mapping[str, NDArray[Any]]
-    """Fields that change over time, by name, (frames, batch, ...). After the last frame of a lost scene they
-    are NaN."""
+    """Fields that change, by name, (frames, batch, ...). After the last frame of a lost scene they are NaN."""
     lost: Mapping[int, DivergedError]
     """Errors of the scenes that lost a particle, by scene number."""
 
@@ -190,10 +190,6 @@ def recorded(
     return TrajectoryBatch(tuple(found), fields, rollout.lost)
 
 
-MOST = 2**28
-"""Greatest size of copied states that are not yet read [bytes]."""
-
-
 class _Poses(dict[str, NDArray[Any]]):
     def __init__(self, scene: QuantityEvaluator, fields: Mapping[str, NDArray[Any]]):
         super().__init__(fields)
@@ -217,8 +213,9 @@ class QuantityReader:
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
         for number in self._wanted.keys() & range(step, end):
-            values = self.beside.of_step(self._wanted[number], number - step).numpy()
-            self.found[number] = {self._wanted[number]: self._scene.of_scene(self._wanted[number], values)}
+            name = self._wanted[number]
+            values = self.beside.of_step(name, number - step).numpy()
+            self.found[number] = {name: self._scene.of_scene(name, values)}
 
 
 class StepReader:
@@ -241,7 +238,7 @@ class StepReader:
             for states in (1, length)
         )
         self._is_ready = wp.Event(first.positions.device) if first.positions.device.is_cuda else None
-        self._step = self._count = 0
+        self._step, self._count, self._members = 0, 0, layout.members
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
         self.look()
@@ -269,10 +266,6 @@ class StepReader:
                     is_lost = number == lost.get(member) and name in self._needs_the_step
                     found = np.full(6, np.nan) if is_lost else sums[name][k, member]
                     self._logs[member].read(name, number, partial(sensor.reading, at, found))
-
-    @property
-    def _members(self) -> int:
-        return self._rollout.solver.layout.members
 
     def _poses_of(self, k: int, member: int) -> dict[str, NDArray[Any]]:
         found = {}

@@ -25,8 +25,6 @@ from cortado.version import __version__
 
 LARGEST = 2**31
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
-
-
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
 REPLAY_LOG = "replay.log"
 _FOLDERS = ("checkpoint", "figures")
@@ -90,8 +88,7 @@ class RunFolder:
         """
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
-        named = files_named(json.loads(scene_json))
-        noted["files"] = {table[key]: _mark(Path(table[key])) for table, key in named}
+        noted["files"] = {table[key]: _mark(table[key]) for table, key in files_named(json.loads(scene_json))}
         with sentences(folder.path):
             folder._make_room(kind, overwrite)
             folder.path.mkdir(parents=True, exist_ok=True)
@@ -136,10 +133,9 @@ class RunFolder:
         noted = read_json(self.environment)
         former = noted.get("kind", kind)
         if former != kind:
-            raise InputError(
-                f"{self.path} contains a run of `cortado {former}`, which `cortado {kind}` cannot resume; choose "
-                f"another --out, or replace it with --overwrite."
-            )
+            advice = "choose another --out, or replace it with --overwrite"
+            found = f"{self.path} contains a run of `cortado {former}`, which `cortado {kind}` cannot resume"
+            raise InputError(f"{found}; {advice}.")
         if self.scene.exists():
             require_same(computed(read_json(self.scene)), computed(json.loads(scene_json)), self.path)
         if "settings" in noted:
@@ -151,7 +147,7 @@ class RunFolder:
         for name, mark in read_json(self.environment).get("files", {}).items():
             if not Path(name).is_file():
                 raise InputError(f"{name} is missing, but the run in {self.path} was made with it: put it back.")
-            if _mark(Path(name)) != mark:
+            if _mark(name) != mark:
                 found = f"{name} has changed since the run in {self.path} was made with it"
                 raise InputError(f"{found}: put the former file back.")
 
@@ -164,8 +160,7 @@ class RunFolder:
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """Read the scene with ``overrides``, without warnings. Raises `InputError` for a damaged file or an invalid
-        override."""
+        """Read the scene with ``overrides``, without warnings. Raises `InputError` if it or they are invalid."""
         text = bytes_of(self.scene).decode(errors="replace")
         with unwarned():
             try:
@@ -212,28 +207,20 @@ class RunFolder:
 
     def _make_room(self, kind: str, overwrite: bool) -> None:
         present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
-        if not present:
-            self._require_own()
-        elif not self._holds_run():
-            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
-        elif not overwrite:
-            resumable = kind in ("run", "optimise") and kind == read_json(self.environment).get("kind")
-            advice = ", or go on with it by --resume" if resumable else ""
-            raise InputError(
-                f"{self.path} already holds a run; choose another --out, or replace it with --overwrite{advice}."
-            )
-        self._remove_unfinished()
-        if present:
-            self._remove_run()
-
-    def _require_own(self) -> None:
-        if Path.cwd().is_relative_to(self.path.resolve()):
+        if not present and Path.cwd().is_relative_to(self.path.resolve()):
             raise InputError(f"{self.path} is the current folder, or contains it; choose another --out.")
-        runs = sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
+        runs = [] if present else sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
         if runs:
             raise InputError(f"{self.path} contains other runs, such as {runs[0]}; choose another --out.")
-
-    def _remove_run(self) -> None:
+        if present and not self._holds_run():
+            raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
+        if present and not overwrite:
+            resumable = kind in ("run", "optimise") and kind == read_json(self.environment).get("kind")
+            advice = f"replace it with --overwrite{', or go on with it by --resume' if resumable else ''}"
+            raise InputError(f"{self.path} already holds a run; choose another --out, or {advice}.")
+        self._remove_unfinished()
+        if not present:
+            return
         written = (*map(self.figures.joinpath, FIGURES), *map(self.path.joinpath, _FILES))
         for path in (*(folder / REPLAY_LOG for folder in self._checkpoints()), *written):
             path.unlink(missing_ok=True)
@@ -307,17 +294,16 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
     """Raise `InputError` if settings differ from the settings of the run in a folder. The message names the setting."""
     for name, (before, now) in sorted(differences(former, given).items()):
         field = ".".join(part if not part.isdigit() else f"[{part}]" for part in name.split(".")).replace(".[", "[")
-        raise InputError(
-            f"The run in {folder} was begun with {field} = {_written(before)} and is now given {field} = "
-            f"{_written(now)}; give the former, or choose another --out."
-        )
+        found = f"The run in {folder} was begun with {field} = {_written(before)} and is now given"
+        raise InputError(f"{found} {field} = {_written(now)}; give the former, or choose another --out.")
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
     """Return pairs of different values by dotted name. ``missing`` replaces an absent value."""
+    are_lists = all(isinstance(own, list) and any(isinstance(e, Mapping) for e in own) for own in (one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}
-    elif _are_tables(one) and _are_tables(other) and len(one) == len(other):
+    elif are_lists and len(one) == len(other):
         pairs = {str(k): pair for k, pair in enumerate(zip(one, other, strict=True))}
     else:
         return {} if one == other else {name: [one, other]}
@@ -332,10 +318,6 @@ def _written(value: Any) -> str:
     return json.dumps(value)[: 2 * LONGEST] if isinstance(value, dict) else shown(value)
 
 
-def _are_tables(value: Any) -> bool:
-    return isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value)
-
-
 def _version(package: str) -> str | None:
     try:
         return metadata.version(package)
@@ -343,5 +325,5 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _mark(path: Path) -> str:
-    return sha256(bytes_of(path)).hexdigest()
+def _mark(path: str) -> str:
+    return sha256(bytes_of(Path(path))).hexdigest()

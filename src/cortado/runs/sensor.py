@@ -18,6 +18,8 @@ from cortado.scene.discrete_scene import Lattice
 from cortado.scene.shape_tables import Container
 from cortado.scene.solids import SolidTable
 
+TIME = "time [s]"
+
 
 class Cut(Protocol):
     @property
@@ -55,9 +57,6 @@ class Sensor(Protocol):
 
     def adjoint(self, at: Reading, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Convert the adjoint ``bar`` (k,) of the reading to adjoints of fields and quantities by name."""
-
-
-TIME = "time [s]"
 
 
 def named(what: str, name: Any, of: str) -> str:
@@ -113,9 +112,8 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
     require_table("sensors", given, "{'gauge': sensor}")
     for name in given:
         if not isinstance(name, str) or name in taken:
-            raise InputError(
-                f"sensors has the name {shown(name)}, but names must be texts other than {', '.join(sorted(taken))}."
-            )
+            wanted = f"names must be texts other than {', '.join(sorted(taken))}"
+            raise InputError(f"sensors has the name {shown(name)}, but {wanted}.")
     return {name: checked_sensor(sensor) for name, sensor in given.items()}
 
 
@@ -166,8 +164,7 @@ class SensorLog:
         self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
 
     def read(self, name: str, number: int, reading: Callable[[], NDArray[Any]]) -> None:
-        """Store the reading (k,) of state ``number``, unless it is already stored. It is NaN if the next step loses a
-        particle."""
+        """Store the reading (k,) of state ``number``, once. It is NaN if the next step loses a particle."""
         if number == len(self._rows[name]):
             try:
                 self._rows[name].append(reading())
@@ -221,12 +218,8 @@ def from_csv(path: Path) -> dict[str, Readings]:
     }
 
 
-Summary = dict[str, dict[str, dict[str, float]]]
-
-
-def summary(readings: Mapping[str, Readings]) -> Summary:
-    """Return the last reading, the mean over time, and the reading with the greatest absolute value, for each number of
-    each sensor."""
+def summary(readings: Mapping[str, Readings]) -> dict[str, dict[str, dict[str, float]]]:
+    """Return the last, the mean and the greatest absolute reading, for each number of each sensor."""
     return {name: {column: _of(own, column) for column in own.units} for name, own in readings.items()}
 
 

@@ -24,6 +24,8 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 from cortado.scene.restart import Clock, Origin, RestartState
 from cortado.scene.scene import Scene
 
+SUFFIXES = (".vtkhdf", ".hdf")
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -73,9 +75,6 @@ def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[st
         advice = f'record it, as in simulation.run(steps, record=["{name}"]), or ask simulation.quantity for it'
         raise InputError(f"{name} was not recorded, {found} there: {advice}.")
     return quantities[name]
-
-
-SUFFIXES = (".vtkhdf", ".hdf")
 
 
 @public
@@ -139,11 +138,9 @@ class Trajectory:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
         steps = {name: len(column) for name, column in self.diagnostics.items()}
         if self.positions.ndim != 3 or self.positions.shape != self.velocities.shape or len(frames) > 1:
-            raise InputError(
-                f"Positions and velocities must both be (frames, n, d) with a time and a step per frame, "
-                f"but found {self.positions.shape}, {self.velocities.shape}, {self.times.shape} and "
-                f"{self.steps.shape}."
-            )
+            wanted = "Positions and velocities must both be (frames, n, d) with a time and a step per frame"
+            found = f"{self.positions.shape}, {self.velocities.shape}, {self.times.shape} and {self.steps.shape}"
+            raise InputError(f"{wanted}, but found {found}.")
         if len(set(steps.values())) > 1:
             raise InputError(f"The diagnostics must be of one length, but have {steps}.")
 
@@ -164,7 +161,14 @@ class Trajectory:
         """Return a frame, or a trajectory of some frames with the diagnostics of the whole run. Raises `IndexError` for
         a missing frame, and `InputError` unless k is a whole number or a slice."""
         if isinstance(k, slice):
-            return self._chosen(k)
+            names = ("times", "steps", "positions", "velocities", "mass_fractions")
+            arrays = {name: getattr(self, name) for name in names}
+            kept: dict[str, Any] = {name: None if array is None else array[k] for name, array in arrays.items()}
+            for key, of in (("others", self.others), ("quantities", self.quantities)):
+                kept[key] = {name: array[k] for name, array in of.items()}
+            kept["solids"] = SolidMotions({name: motion[k] for name, motion in self.solids.items()})
+            stride = k.indices(len(self))[2]
+            return replace(self, **kept, marks=self.marks and self.marks.chosen(kept["times"], stride))
         try:
             place = index(k)
         except TypeError:
@@ -183,16 +187,6 @@ class Trajectory:
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
-
-    def _chosen(self, frames: slice) -> Trajectory:
-        names = ("times", "steps", "positions", "velocities", "mass_fractions")
-        arrays = {name: getattr(self, name) for name in names}
-        kept: dict[str, Any] = {name: None if array is None else array[frames] for name, array in arrays.items()}
-        each = {name: getattr(self, name) for name in ("others", "quantities")}
-        kept |= {key: {name: array[frames] for name, array in own.items()} for key, own in each.items()}
-        kept["solids"] = SolidMotions({name: motion[frames] for name, motion in self.solids.items()})
-        kept["marks"] = None if self.marks is None else self.marks.chosen(kept["times"], frames.indices(len(self))[2])
-        return replace(self, **kept)
 
     @property
     def due(self) -> NDArray[Any]:
@@ -276,9 +270,8 @@ class Trajectory:
         """
         of = self.scene if scene is None else scene
         if of is None:
-            raise InputError(
-                "scene is missing, but must be given, as a trajectory from a file does not contain its scene."
-            )
+            why = "as a trajectory from a file does not contain its scene"
+            raise InputError(f"scene is missing, but must be given, {why}.")
         return on_top("export")(self, folder, to, of)
 
     def to_xarray(self) -> Any:

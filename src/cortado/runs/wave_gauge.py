@@ -44,14 +44,7 @@ from cortado.scene.motions import Pose, position_name, scale_name
 from cortado.scene.shape_tables import Container, NoContainer
 from cortado.scene.solids import SolidTable
 
-FINE = 0.5
-ACROSS_REACH = 20.0
-"""Least number of points between the axis and the side of a column."""
-LEAST = 1e-3
-"""Free fraction of a level that counts as full."""
 MOST = 4_000_000
-NARROW = 0.01
-"""Least fraction of a column's cross-section inside the container."""
 FILM = 1.0
 """Depth of the film of fluid above a solid with fluid below it [spacings]."""
 
@@ -76,13 +69,11 @@ class Standing:
         return cls(table.own_solid(), pose.position, pose.rotation[:d, :d], pose.scale, pose)
 
     def local(self, points: NDArray[Any], domain: Domain) -> NDArray[Any]:
-        """Convert points (n, d) [m] to the frame of the solid. Along periodic axes, the image nearest to the solid is
-        used."""
+        """Convert points (n, d) [m], along periodic axes their nearest images, to the frame of the solid."""
         return np.asarray(domain.shortest(points - self.middle) @ self.turn / self.scale)
 
     def reach(self, up: NDArray[Any], foot: NDArray[Any]) -> tuple[float, float]:
-        """Return the greatest height of the solid above the point ``foot`` (d,) along ``up`` (d,) [m], and its radius
-        [m]."""
+        """Return the greatest height of the solid above ``foot`` (d,) along ``up`` (d,) [m], and its radius [m]."""
         ends = self.scale * corners(*self.own.extent())
         high = float(((self.middle - foot) @ up) + (ends @ self.turn.T @ up).max())
         return high, float(np.linalg.norm(ends, axis=1).max()) if self.own.is_bounded else np.inf
@@ -120,7 +111,7 @@ class Axis:
 def _axis_of(spacing: float, position: tuple[float, ...], floor: float, up: tuple[float, ...], reach: float) -> Axis:
     foot = np.array(position) + (floor - np.dot(position, up)) * np.array(up)
     beside = tuple(map(tuple, np.linalg.svd(np.array([up]))[2][1:].tolist()))
-    return Axis(tuple(foot.tolist()), up, reach, min(FINE * spacing, reach / ACROSS_REACH), FILM * spacing, beside)
+    return Axis(tuple(foot.tolist()), up, reach, min(0.5 * spacing, reach / 20.0), FILM * spacing, beside)
 
 
 @dataclass(frozen=True)
@@ -174,10 +165,9 @@ class Column:
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The height as a piecewise linear function of the depth of the fluid: heights [levels] and depths [m] at the
-        knots."""
+        """Heights [levels] and depths of fluid [m] at the knots of the height, which is linear between them."""
         filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
-        kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < LEAST, False)
+        kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < 1e-3, False)  # full
         kept[: int(np.argmin(blocked))] = False  # what stands on the floor
         for ceiling in np.flatnonzero(blocked[1:] & ~blocked[:-1]) + 1:
             kept[ceiling + 1 :] &= filled[ceiling + 1 :] >= filled[ceiling] + self.axis.film
@@ -200,8 +190,7 @@ class Column:
         return step * (ends[low] + part * (ends[low + 1] - ends[low])), below, float(slope)
 
     def pushes(self, depth: float, bar: float, domain: Domain) -> "list[Push]":
-        """Convert the derivative ``bar`` with respect to the height to derivatives with respect to the poses
-        of solids."""
+        """Convert the derivative ``bar`` along the height to derivatives along the poses of solids."""
         _, below, slope = self.level(depth)
         shares, found = bar * slope * below, list[Push]()
         for one, far in self.solids:
@@ -255,7 +244,7 @@ def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
         return None
     places, weights = axis.places()
     inside = sides.cell_shares(foot + places, axis.step)
-    return inside if weights @ inside > NARROW else None
+    return inside if weights @ inside > 0.01 else None  # not too narrow a part
 
 
 @lru_cache(maxsize=64)
@@ -263,10 +252,6 @@ def _at_rest(axis: Axis, tables: tuple[SolidTable, ...], domain: Domain, contain
     if not tables:
         return None
     return Column.of(axis, [Standing.of(table, len(axis.foot)) for table in tables], domain, container)
-
-
-FINER = 4.0
-"""Factor for the number of parts of a particle in a column with solids."""
 
 
 @fixed
@@ -318,12 +303,13 @@ class WaveGauge(Summed):
     def summed(self, at: SensedScene) -> WeightedSum:
         """Return the sum over particles in the column."""
         axis, across, ride = self._axis(at), at.dimension - 1, ride_of(self.on, self.axes == "body", at)
+        finer = axis.reach / 4.0  # as solids cut particles
         if ride is not None:
-            parts = parts_of(axis.reach / FINER, at, self._across, across)
+            parts = parts_of(finer, at, self._across, across)
             return WeightedSum(Around(np.array(axis.foot), axis.reach, self._across, parts), ride=ride)
         whole = cut_by(axis, at.container) is None and not any(table.moves for table in at.solids)
         whole = whole and _at_rest(axis, at.solids, at.lattice.domain, at.container) is None
-        parts = parts_of(axis.reach if whole else axis.reach / FINER, at, self._across, across)
+        parts = parts_of(axis.reach if whole else finer, at, self._across, across)
         return WeightedSum(Around(self.position, axis.reach, self._across, parts))
 
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:

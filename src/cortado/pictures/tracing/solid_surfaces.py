@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,6 @@ FINE, FINE_OWN = 0.03, 0.05
 """Greatest width of the faces of round solids, relative to the contents and relative to the solid."""
 LONGEST = 0.04
 """Greatest side of illuminated triangles, relative to the size of the contents."""
-
-
-Placed = tuple[ShownSolid, SolidMesh]
 
 
 MODULE = kernel_module("shadow")
@@ -183,8 +181,11 @@ class FloorShadow:
             return
         stage = self._stage
         slope = stage.sun[::2] / stage.sun[1]
-        soft = [max(part * stage.size, least) / self.cell for part in (KEY, AROUND)]
-        bells = [_bell(sigma) for sigma in soft]
+        bells = list[Points]()
+        for part in (KEY, AROUND):
+            soft = max(part * stage.size, least) / self.cell  # standard deviation of a bell [nodes]
+            bell = np.exp(-0.5 * (np.arange(int(4.0 * soft + 0.5) + 1) / soft) ** 2)
+            bells.append(bell / (2.0 * bell.sum() - 1.0))
         begin, shape = self._reached(parts, slope, max(map(len, bells)))
         seen = {"begin": wp.vec2i(*begin), "corner": wp.vec3(*self.corner), "cell": self.cell}
         key = self._thickness(parts, volumes[0], bells[0], shape, slope=wp.vec2(*slope), fading=0.0, **seen)
@@ -218,19 +219,16 @@ class FloorShadow:
         return wp.array(values.astype(np.float32), dtype=wp.float32, device=self._device)
 
 
-def _bell(sigma: float) -> Points:
-    """Return Gaussian weights at nodes along an axis. The standard deviation is ``sigma`` nodes."""
-    bell = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / sigma) ** 2)
-    found: Points = bell / (2.0 * bell.sum() - 1.0)
-    return found
-
-
 class SolidSurfaces:
     """The triangle surfaces of the solids of a stage."""
 
     def __init__(self, stage: Stage, device: Any):
-        self._stage, self._device = stage, device
-        self._own = {one.name: _mesh_of(one, stage.size) for one in stage.solids}
+        self._stage, self._device, self._own = stage, device, dict[str, SolidMesh]()
+        for one in stage.solids:  # relative to its middle; that of a tank is of its cavity
+            own = float(np.ptp(one.shape.extent(), axis=0).max())
+            faces = one.shape.shown_faces(min(FINE * stage.size, FINE_OWN * own))
+            longest = np.inf if one.transparency == 1.0 else LONGEST * stage.size  # what is clear has no own light
+            self._own[one.name] = SolidMesh.of(faces.reversed() if one.is_tank else faces, longest)
 
     @property
     def kinds(self) -> tuple[bool, bool]:
@@ -252,12 +250,15 @@ class SolidSurfaces:
             if not (own := [pair for pair in placed if _is_clear(pair[0]) == is_clear]):
                 continue
             mesh, counts = SolidMesh.joined([one for _, one in own]), [len(one.triangles) for _, one in own]
-            surfaces.append(self._surface(mesh, own))
+            colours = np.concatenate([np.tile(one.colour, (len(points.points), 1)) for one, points in own])
+            whole = Mesh(mesh.points, mesh.triangles, mesh.normals, colours)
+            surfaces.append(DeviceSurface.on(self._device, whole, partial(self._softened, mesh)))
             lit[k] = surfaces[-1].lit
             if is_clear:
                 found.clear, found.has_tank = lit[k].mesh, int(any(one.is_tank for one, _ in own))
-                left = np.repeat([_left(one) for one, _ in own], counts, axis=0)
-                lit[k].left = wp.array(left, dtype=wp.vec2, device=self._device)
+                left = [(1.0, one.transparency) if one.is_tank else (one.transparency**0.5,) * 2 for one, _ in own]
+                passed = np.repeat(left, counts, axis=0)  # of light, at a surface from inside and from outside
+                lit[k].left = wp.array(passed, dtype=wp.vec2, device=self._device)
                 lit[k].from_edges = wp.array(mesh.from_edges, dtype=wp.mat33, device=self._device)
             else:
                 found.opaque = lit[k].mesh
@@ -266,30 +267,12 @@ class SolidSurfaces:
         found.surfaces = wp.array(lit, dtype=LitSurface, device=self._device)
         return found, surfaces
 
-    def _placed(self, solids: Sequence[ShownSolid]) -> list[Placed]:
+    def _placed(self, solids: Sequence[ShownSolid]) -> list[tuple[ShownSolid, SolidMesh]]:
         return [(one, self._own[one.name].moved(one.turn, one.position)) for one in solids]
 
-    def _surface(self, mesh: SolidMesh, solids: Sequence[Placed]) -> DeviceSurface:
-        colours = np.concatenate([np.tile(one.colour, (len(own.points), 1)) for one, own in solids])
-
-        def softened(light: wp.array) -> wp.array:
-            return wp.array(mesh.smoothed(light.numpy()), dtype=wp.vec3, device=self._device)
-
-        return DeviceSurface.on(self._device, Mesh(mesh.points, mesh.triangles, mesh.normals, colours), softened)
-
-
-def _mesh_of(shown: ShownSolid, size: float) -> SolidMesh:
-    """Make the mesh of a solid relative to its middle. For a tank it is the mesh of the cavity."""
-    own = float(np.ptp(shown.shape.extent(), axis=0).max())
-    faces = shown.shape.shown_faces(min(FINE * size, FINE_OWN * own))
-    longest = np.inf if shown.transparency == 1.0 else LONGEST * size  # what is clear has no light of its own
-    return SolidMesh.of(faces.reversed() if shown.is_tank else faces, longest)
+    def _softened(self, mesh: SolidMesh, light: wp.array) -> wp.array:
+        return wp.array(mesh.smoothed(light.numpy()), dtype=wp.vec3, device=self._device)
 
 
 def _is_clear(shown: ShownSolid) -> bool:
     return shown.is_tank or shown.transparency > 0.0
-
-
-def _left(shown: ShownSolid) -> tuple[float, float]:
-    """Return the transmitted fraction of light at a surface of a solid, from inside and from outside."""
-    return (1.0, shown.transparency) if shown.is_tank else (shown.transparency**0.5,) * 2

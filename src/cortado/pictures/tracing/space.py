@@ -229,7 +229,9 @@ def environment_of(stage: Stage) -> Any:
     s.has_floor, s.floor_height = int(picture.floor), float(stage.lower[1])
     s.floor_colour = wp.vec3(*(0.93 * horizon))
     s.floor_centre = wp.vec3(*(0.5 * (stage.lower + stage.upper)))
-    s.grid = _round_length(stage.size / 6.0)
+    length = stage.size / 6.0  # of a square on the floor, 1, 2 or 5 at the front
+    power = 10.0 ** np.floor(np.log10(length))
+    s.grid = float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
     s.glass = NO_GLASS
     if stage.container.extent() is not None:
         lower, upper = stage.glass_ends
@@ -245,11 +247,6 @@ def environment_of(stage: Stage) -> Any:
             s.has_walls, s.wall_colour, s.wall_reflectivity = 1, wp.vec3(*finish.colour), finish.reflectivity
         s.panes = wp.mat33(*(stage.panes * (1 - s.has_walls)).ravel(), 0.0, 0.0, 0.0)
     return s
-
-
-def _round_length(length: float) -> float:
-    power = 10.0 ** np.floor(np.log10(length))
-    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9)))
 
 
 class State(NamedTuple):
@@ -311,9 +308,10 @@ class SpacePainter:
         stage, s, particles, shadow = self._placed(state)
         if steady is None:
             shadow.of_fluid(particles)
-            return stage, s, self._surface(stage, s, particles, None), shadow
-        shadow.light = steady.light
-        return stage, s, self._surface(stage, s, particles, (steady.b, steady.blocks)), shadow
+        else:
+            shadow.light = steady.light
+        level = None if steady is None else (steady.b, steady.blocks)
+        return stage, s, self._surface(stage, s, particles, level), shadow
 
     def _placed(self, state: State) -> tuple[Stage, Any, Particles, FloorShadow]:
         stage = self.stage.at(state.pose, state.view)
@@ -361,11 +359,10 @@ class SpacePainter:
         return found
 
     def _illuminate(self, surface: DeviceSurface, lamps: tuple[wp.array, wp.array], given: dict[str, Any]) -> None:
-        around, in_lamp = lamps
         own = {"points": surface.mesh.points, "normals": surface.lit.normals, "light": surface.lit.light}
-        how = {"reach": 0.2 * self.stage.size, "clearness": self.stage.clearness}
-        count = len(surface.mesh.points)
-        self._launch(self._illuminates, count, **given, **own, **how, directions=around, sun_directions=in_lamp)
+        own |= {"directions": lamps[0], "sun_directions": lamps[1]}
+        how = {"reach": 0.2 * self.stage.size, "clearness": 0.85 * self.stage.transparency}
+        self._launch(self._illuminates, len(surface.mesh.points), **given, **own, **how)
         if surface.softened is not None:
             wp.copy(surface.lit.light, surface.softened(surface.lit.light))
 
