@@ -114,8 +114,7 @@ def test_guided_is_named_where_it_is_given_a_batch():
 MODULES = [name for name in cortado.__all__ if isinstance(getattr(cortado, name), ModuleType)]
 PUBLIC = ["cortado", *(f"cortado.{name}" for name in [*MODULES, "environments", "jax"])]
 ODD = ("nothing", "a fraction", "a letter", "an object")
-FEW = {"Problem.several_tangents", "Simulation.room", "OverTime.at", "Ensemble.around", "Ensemble.evaluated"}
-FEW |= {"EnsembleMean.combined", "SensorMatch", "Trajectory.picture"}
+FEW = {"Ensemble.around", "Ensemble.evaluated", "EnsembleMean.combined", "Trajectory.picture"}
 """What gets the odd values alone, as parts of Cortado call it with what was looked at, or as it takes seconds."""
 
 

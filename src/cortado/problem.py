@@ -10,7 +10,7 @@ import numpy as np
 from cortado.arrays import check_step_numbers, check_steps, require_arguments, require_function, whole_number
 from cortado.calls import Staying, counted, fixed, public
 from cortado.device.threads import Turn, in_turn
-from cortado.errors import DivergedError, InputError, warn
+from cortado.errors import DivergedError, InputError, shown, warn
 from cortado.gradients import AdjointEstimator, Estimate, Exact, GradientEstimator, estimate
 from cortado.gradients.estimator import checked_reverse
 from cortado.losses import Frames, Loss, Snapshot, SnapshotAdjoint, SnapshotBatch
@@ -270,7 +270,10 @@ class Problem:
         """Run once in forward mode along several directions, and return a table of the states after the given numbers
         of ``steps``. ``each`` yields pairs of directions and an observer, as in `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
-        for directions, observe in each:
+        for pair in each if isinstance(each, Iterable) else [each]:
+            if not isinstance(pair, Sequence) or len(pair) != 2:
+                raise InputError(f"each has {shown(pair)}, but must have pairs of directions and a function.")
+            directions, observe = pair
             require_arguments("observe", observe, OBSERVED)
             along.append((self._space.checked(directions, "direction"), observe))
         varied = {name for directions, _ in along for name in directions}

@@ -10,7 +10,7 @@ from weakref import WeakSet
 
 import numpy as np
 
-from cortado.arrays import whole_number
+from cortado.arrays import as_one_number, whole_number
 from cortado.calls import counted, fixed, public
 from cortado.device.modules import device_named, start_warp
 from cortado.device.precision import checked_lanes, precision_named
@@ -367,11 +367,12 @@ class Simulation(Stepping):
     def room(self, steps: int, checkpoints: float) -> int:
         """Return the number of runs of ``steps`` steps that should be computed together. They fit into half of the free
         memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
+        steps, most = whole_number("steps", steps, 0), as_one_number("checkpoints", checkpoints)
         neighbours, real = build.first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
         states = real * self.numbers_in_frame(3) * 2 * max(isqrt(steps), 1)
         fitting = within(np.inf, self.device) // own
-        kept = checkpoints // states if checkpoints else fitting
+        kept = most // states if most else fitting
         return int(max(min(WORTH["cpu" if self.device.is_cpu else "cuda"] // self.particles, fitting, kept), 1))
 
     def parameters(self) -> dict[str, np.ndarray]:

@@ -162,7 +162,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         unknown options."""
         if not self._envs.closed and (state := saved_option(options, seed)) is not None:
             return self.restore(state), {}
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else whole_number("seed", seed, 0))
         self._envs._generators = [self.np_random]
         self._envs._horizon = self.scenes.task.horizon if self.spec is None else sys.maxsize  # else a wrapper counts
         seen, info = self._envs.reset()
@@ -286,7 +286,7 @@ class FluidVectorEnv(VectorEnv):
             raise InputError(f"seed has {len(seeds)} numbers, but must have {self.num_envs}, one for each environment.")
         for b, own in enumerate(seeds):
             if mask[b] and own is not None:
-                self._generators[b] = np_random(own)[0]
+                self._generators[b] = np_random(whole_number("seed", own, 0))[0]
         self._begin(mask)
         self._observations = np.where(mask[:, None], self.scenes.observed(), self._observations)
         return self._observations.copy(), {}

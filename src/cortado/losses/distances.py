@@ -300,7 +300,11 @@ class SensorMatch:
         (k,). ``target`` (k,) has one number for each column of the sensor. Columns with a NaN target are ignored."""
         self.sensor, self.weight = checked_sensor(sensor), as_one_number("weight", weight)
         self.target = np.atleast_1d(read_only("target", target))
-        self.scale = np.broadcast_to(as_numbers("scale", scale), self.target.shape)
+        divisors = as_numbers("scale", scale)
+        if divisors.shape not in ((), self.target.shape) or not ((divisors > 0.0) & (divisors < np.inf)).all():
+            wanted = f"a number greater than 0, or {len(self.target)} of them, one for each column"
+            raise InputError(f"scale is {shown(scale)}, but must be {wanted}.")
+        self.scale = np.broadcast_to(divisors, self.target.shape)
         arrays = self.target.tobytes() + self.scale.tobytes()
         self.fingerprint = sha256(f"{sensor!r} {self.weight!r}".encode() + arrays).hexdigest()
 
@@ -352,8 +356,8 @@ class Series(Frames):
         if not (sizes > 0.0).all():
             raise InputError("scale must be greater than 0.")
         step, stride = as_one_number("time_step", time_step), whole_number("every", every, 1)
-        if not step > 0.0:
-            raise InputError(f"time_step is {step:g}, but must be greater than 0.")
+        if not 0.0 < step < np.inf:
+            raise InputError(f"time_step is {step:g}, but must be finite and greater than 0.")
         first, last = int(np.ceil(moments[0] / step - 1e-9)), int(np.floor(moments[-1] / step + 1e-9))
         steps = [k for k in range(max(first, 0), last + 1) if k % stride == 0]
         if not steps:

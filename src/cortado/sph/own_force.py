@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from cortado.arrays import read_only
+from cortado.arrays import as_numbers, read_only
 from cortado.calls import fixed
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision
@@ -64,11 +64,17 @@ class OverTime:
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Return the values at ``times`` (n,) [s]."""
-        return self._course.at(times)
+        return self._course.at(self._moments(times))
 
     def rates(self, times: np.ndarray) -> np.ndarray:
         """Return the time derivatives at ``times`` (n,) [s]."""
-        return self._course.rates(times)
+        return self._course.rates(self._moments(times))
+
+    def _moments(self, times: Any) -> np.ndarray:
+        found = as_numbers("times", times)
+        if found.ndim > 1 or not np.isfinite(found).all():
+            raise InputError(f"times are {shown(times)}, but must be a list of finite times [s].")
+        return found
 
 
 @fixed

@@ -128,7 +128,10 @@ def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
     """Return times plus ``clock`` [s], measured numbers and noise. Raises `InputError` for unsuitable arrays."""
-    moments = read_only("times", as_numbers("times", times) + as_one_number("clock", clock))
+    late = as_one_number("clock", clock)
+    if not np.isfinite(late):
+        raise InputError(f"clock is {late:g}, but must be a finite number of seconds.")
+    moments = read_only("times", as_numbers("times", times) + late)
     values = read_only("measured", measured)
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
         found = f"has {len(moments)}" if moments.ndim == 1 else f"has shape {moments.shape}"
