@@ -10,7 +10,7 @@ import warp as wp
 from cortado import CortadoWarning, InputError, Problem, SceneError, Simulation, losses
 from cortado.device.launching import KernelLauncher
 from cortado.device.precision import FLOAT32, FLOAT64
-from cortado.rollout.outcome import divergence_sentence
+from cortado.rollout.run_checks import divergence_sentence
 from cortado.solvers.projection.coarse_levels import Levels
 from finite_differences import both_modes, central_difference
 from reference_projection import Projection

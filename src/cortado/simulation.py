@@ -21,10 +21,9 @@ from cortado.files.image_encoding import ShadedPicture
 from cortado.lazy import on_top
 from cortado.particles.state import State
 from cortado.render.renderer import Renderer, scene_renderer
-from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_space import ParameterSpace, end_after, steps_of_run
 from cortado.rollout.rollout import Rollout
-from cortado.rollout.run_checks import check_sizes, one_for_each
+from cortado.rollout.run_checks import check_sizes, one_for_each, trouble
 from cortado.rollout.scene_parameters import SceneParameters
 from cortado.rollout.step_bounds import expected_frames
 from cortado.rollout.stepper import Stepping

@@ -18,8 +18,8 @@ from cortado.files.terminal import announce, keeping, track
 from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.particles.state import State
 from cortado.pictures.pages import Section
-from cortado.rollout.outcome import trouble
 from cortado.rollout.rollout import Progress, Rollout
+from cortado.rollout.run_checks import trouble
 from cortado.rollout.step_bounds import done_of, ends_at_a_time
 from cortado.runs.frames import Marks, append_frame, frame_writer
 from cortado.runs.recording import EverySteps, FrameChoice

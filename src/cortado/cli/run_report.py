@@ -24,8 +24,8 @@ from cortado.pictures.particle_view import scene_view
 from cortado.pictures.plots import images, particles
 from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
-from cortado.rollout.outcome import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.rollout.rollout import Rollout
+from cortado.rollout.run_checks import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.runs.frames import Pace, SolidMotions, common_rate, posed
 from cortado.runs.run_folder import RunFolder
 from cortado.runs.sensor import Readings, summary

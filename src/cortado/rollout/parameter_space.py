@@ -10,13 +10,13 @@ from cortado.arrays import as_numbers, as_one_number, check_steps, require_names
 from cortado.device.threads import WARP
 from cortado.errors import InputError, OutOfRangeError, shown, warn
 from cortado.particles.state import Parameters, State
-from cortado.rollout.outcome import dry_sentence
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import (
     FirstPositions,
     check_places,
     check_sizes,
     check_state,
+    dry_sentence,
     origin_of,
     path_sentence,
     unstable_sentence,

@@ -25,10 +25,9 @@ from cortado.rollout.device_states import (
     of_lost,
     without_lost,
 )
-from cortado.rollout.outcome import trouble
 from cortado.rollout.parameter_space import STATE_TIME, ParameterSpace
 from cortado.rollout.rollout import AdjointStep, BackwardStep, Residual, Rollout
-from cortado.rollout.run_checks import check_directions
+from cortado.rollout.run_checks import check_directions, trouble
 from cortado.rollout.scene_parameters import Simulated
 from cortado.scene.parameter_values import Arrays, Values
 
