@@ -26,7 +26,8 @@ def as_number(value: Any) -> float | None:
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
-    """Convert real numbers, lists or arrays of other libraries to float64. Arrays of float64 are not copied.
+    """Convert real numbers to a float64 array. The numbers may be a list or an array of another library. Arrays of
+    float64 are not copied.
 
     Raises `InputError` for complex numbers, text, bools and masked entries. The error message begins with ``what``.
     """
@@ -84,7 +85,8 @@ def require_at_most(what: str, value: Any, most: int) -> None:
 
 
 def whole_number(what: str, value: Any, least: int) -> int:
-    """Return a whole number, such as 3 or 3.0, as an int of at least ``least``; raise `InputError` otherwise."""
+    """Convert a whole number, such as 3 or 3.0, to an int. Raises `InputError` for any other value, or for a number
+    below ``least``."""
     whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
@@ -100,7 +102,8 @@ def require_function(what: str, value: Any, *arguments: str) -> None:
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raise `InputError` if ``function`` does not take the arguments ``wanted``. The message mentions ``other``."""
+    """Raise `InputError` if ``function`` does not take the arguments ``wanted``. The error message ends with
+    ``other``."""
     if not callable(function) or isinstance(function, type):
         said = f"{what} is {shown(function)}"
         raise InputError(f"{said}, but must be a function of {', '.join(wanted) or 'nothing'}{other}.")
@@ -122,7 +125,8 @@ def require_truth(what: str, value: object) -> None:
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raise `InputError` with ``wanted`` unless ``value`` is an object with the methods ``names``."""
+    """Raise `InputError` unless ``value`` is an object with the methods ``names``. The error message says that the
+    value must be ``wanted``."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 

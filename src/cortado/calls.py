@@ -236,7 +236,8 @@ def sized(arrays: Mapping[str, Any]) -> str:
 
 
 class ShortRepr:
-    """A base class for dataclasses with only the shapes of arrays in ``repr``. Subclasses need ``repr=False``."""
+    """A base class of dataclasses. In ``repr``, arrays are replaced by their shapes. Subclasses must be declared with
+    ``repr=False``."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

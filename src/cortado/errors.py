@@ -45,8 +45,9 @@ class InputError(CortadoError):
 
 
 class OutOfRangeError(InputError):
-    """An error for a parameter value that makes a run impossible. The value is out of range or beyond the precision, or
-    there is no room for the fluid. When many points are evaluated, only the bad point fails."""
+    """An error for a parameter value that makes a run impossible. Either the value is out of range or beyond the
+    floating-point precision, or there is no room for the fluid. If a problem is evaluated at many points, only this
+    point fails."""
 
 
 class Words(str):
@@ -58,17 +59,18 @@ class MissingDerivativeError(InputError):
 
 
 class SceneError(CortadoError):
-    """An error in a scene, with the key, the value found and the value wanted. The exit code is 2."""
+    """An error in a scene. The message has the key, the wrong value, and what the value must be. The exit code is 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """Store the parts of the error message. ``sentence`` replaces "is <found>, but must be <wanted>" in it."""
+        """Store the parts of the error message. ``sentence`` replaces "is <found>, but must be <wanted>" in the
+        message."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
         """Path of the scene file as the user gave it, or None for a scene built in Python."""
         self.field = field
-        """Key of the scene, such as ``fluid[0].upper``. Empty for an error of the whole scene."""
+        """Key of the scene, such as ``fluid[0].upper``. The key is empty for an error of the whole scene."""
         self.found = found
-        """Wrong value, or `Words` on the mistake."""
+        """Wrong value, or a text of type `Words` that describes the mistake."""
         self.wanted = wanted
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
@@ -87,7 +89,8 @@ class ComputationError(CortadoError):
 
 
 class DivergedError(ComputationError):
-    """An error for a lost particle, which left its container, or has a position that is not finite or too far away."""
+    """An error for a lost particle. A particle is lost if it leaves its container, or if its position is too far away
+    or not finite."""
 
     def __init__(
         self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""
@@ -103,7 +106,7 @@ class DivergedError(ComputationError):
         self.others = others
         """Number of further particles that were lost in the same step."""
         self.preface = preface
-        """Sentence on all runs, if there are several runs."""
+        """Sentence about all runs at the beginning of the message, if there are several runs."""
 
     def with_advice(self, advice: str) -> "DivergedError":
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)

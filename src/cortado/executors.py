@@ -109,8 +109,9 @@ class Distributed(Executor):
     """
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
-        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client. ``patience`` is the waiting
-        time for a worker when all are lost [s]. Raises `InputError` without distributed or a scheduler."""
+        """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client. After the loss of all
+        workers, the executor waits for new workers for the time ``patience`` [s]. Raises `InputError` if distributed is
+        not installed or the scheduler does not answer."""
         module = _distributed()
         self.patience, self._owned = patience, isinstance(scheduler, str)
         self.client = _connected(module, scheduler) if isinstance(scheduler, str) else scheduler
@@ -139,9 +140,11 @@ class Distributed(Executor):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the results of ``function`` for all ``items``; see `Executor.map`. It begins with the first worker.
+        """Return the results of ``function`` for all ``items``; see `Executor.map`. The computation begins with the
+        first available worker.
 
-        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` without workers.
+        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` if there are no
+        workers.
         """
         _check_call(function, items, on_result)
         return _Map(self, Payload.of(function), on_result).results(items)
@@ -171,7 +174,7 @@ class _Map:
         self._executor, self._payload, self._on_result = executor, payload, on_result
         self._calls = executor.client.get_executor(pure=False)
         self._sent: dict[Future[Any], tuple[int, bytes]] = {}
-        """Number and item of each future."""
+        """Number of the item and pickled item, by future."""
         self._results: dict[int, Any] = {}
         self._failed: tuple[int, BaseException] | None = None
         """Number and error of the first failed item."""
@@ -229,7 +232,8 @@ class _Map:
         return bool(self._sent)
 
     def _count_workers(self, interval: float) -> None:
-        """Count workers, at most once per interval [s]. Raises `ComputationError` if there are none for too long."""
+        """Count workers, at most once per interval [s]. Raises `ComputationError` if there are no workers for
+        too long."""
         now = time.monotonic()
         if now - self._counted < interval:
             return
@@ -328,13 +332,14 @@ class LocalWorkers(Distributed):
 
 @contextmanager
 def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
-    """Start worker processes on this machine, until the end of the ``with`` block. Lost workers are started again.
+    """Start worker processes on this machine, and end them after the ``with`` block. Lost workers are started again.
 
     ``number`` is the number of processes, by default one for each core, or one for each GPU with the ``device`` "cuda".
     On GPUs each process sees one GPU as "cuda:0". Every process imports the script. The code of the script must
     therefore be under ``if __name__ == "__main__":``.
 
-    Raises `InputError` for more processes than GPUs, or for more than 64 processes and more than four for each core.
+    Raises `InputError` for more processes than GPUs. On a CPU, the greatest number is 64, or four for each core if that
+    is more.
 
     Example: ``with cortado.executors.local_workers() as workers: ...``
     """
@@ -378,7 +383,8 @@ def _environments(number: int | None, device: str) -> list[dict[str, str]]:
 
 
 def require_processes(what: str, number: object) -> None:
-    """Raise `InputError` unless ``number`` is a possible number of processes. Its message begins with ``what``."""
+    """Raise `InputError` unless ``number`` is a possible number of processes. The error message begins with
+    ``what``."""
     require_whole(what, number, 1)
     cores = usable_cores()
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)

@@ -62,13 +62,15 @@ class Pyramid:
     The first level is the image. Each further level is the previous level, blurred and halved in size. Coarse levels
     locate a shape before it overlaps its target, and fine levels compare outlines.
 
-    ``levels`` is the number of levels. ``weights`` has a number for each, by default 1, 2, 4 ... from fine to coarse.
+    ``levels`` is the number of levels. ``weights`` has a number for each level, by default 1, 2, 4 ... from fine to
+    coarse.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """Number of levels, by default that of the weights. Without weights the coarsest level has sides of 1 or 2."""
+    """Number of levels, by default the number of weights. Without weights the sides of the coarsest level are 1 or 2
+    pixels."""
     weights: tuple[float, ...] | None = None
     """Weights of the levels (levels,) from fine to coarse. They should increase, as blurring makes shapes fainter."""
 
@@ -111,7 +113,7 @@ class Pyramid:
 
 
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
-    """Return the peak signal-to-noise ratio [dB] for a peak of 1. It is infinite if the images are equal.
+    """Return the peak signal-to-noise ratio [dB] for a peak of 1. The ratio is infinite if the images are equal.
 
     ``image`` and ``target`` are linear pictures (rows, columns, 3).
 
@@ -127,7 +129,8 @@ def reduce(image: Image) -> Image:
 
 
 def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
-    """Return the adjoint of an image (rows, columns) for that of the next coarser level: the transpose of `reduce`."""
+    """Return the adjoint of an image (rows, columns), given the adjoint of the next coarser level. The function is the
+    transpose of `reduce`."""
     rows, columns = shape
     return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
 

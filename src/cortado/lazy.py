@@ -1,6 +1,7 @@
 """Import names when they are first used, so that ``import cortado`` is quick.
 
-Cortado's core does not import packages such as pictures. Its methods, such as `Trajectory.film`, use `on_top`.
+Cortado's core does not import packages such as pictures. Methods that need such a package, as `Trajectory.film`, use
+`on_top`.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Compute a simulation's loss from parameters, its gradient, and its derivative along a direction."""
+"""A simulation's loss as a function of parameters, with its gradient and its directional derivative."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,13 +38,12 @@ from cortado.sph.function_text import code_words
 __all__ = ["NAMES", "UNITS", "Problem"]
 
 SPARSE = 8
-"""Greatest ratio of all states to needed states at which quantities are read during the run."""
 KEPT = 2
 
 
 @dataclass(frozen=True)
 class ProblemForwardPass(Staying):
-    """A stored forward run of a problem, for backward passes."""
+    """A stored forward run of a problem, from which backward passes start."""
 
     loss: Any
     """Loss of the run: a number, or an array (batch,) for a batch of scenes."""
@@ -70,8 +69,8 @@ class ProblemForwardPass(Staying):
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """Return the gradient computed by an ``estimator``, and the derivatives with respect to the first state. The
-        derivatives are a table with the names of the state's fields and ``time``."""
+        """Return the gradient, and the derivatives with respect to the first state, both computed by an ``estimator``.
+        The derivatives with respect to the state are a dictionary by field name, with ``time``."""
         derivative = self._derivatives.of(estimator)
         first, gradient = self._backward(derivative)
         rollout = self._residual.rollout
@@ -101,13 +100,14 @@ class ProblemForwardPass(Staying):
 class Problem:
     """The loss of a simulation over a number of steps, as a function of parameters.
 
-    These parameters may be given in any combination:
+    The following parameters may be given in any combination:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
     - instead of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], the angle by which the scene's gravity is
       turned without a change of its magnitude. Gravity along -y turns towards x and, in 3-D, z; see
       `cortado.scene.parameter_values.Tilt`;
-    - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d);
+    - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d) for n fluid particles, in the
+      order of the scene;
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3]: a number, or (phases,) with several phases;
     - with several phases, the initial ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
     - with emitters, ``NAME.path`` (d,) or (steps, d), the position of the opening after each step [m];
@@ -116,9 +116,9 @@ class Problem:
     - with a loss of images, ``colours`` (phases, 3);
     - with user-defined forces in ``simulation.forces``, the parameters of these forces, such as ``drag.k``.
 
-    Omitted parameters have the scene's values, including schedules. n is the number of fluid particles, in the order of
-    the scene. Methods take ``parameters``, a table of values by parameter name. The arguments ``gradient`` and
-    ``estimator`` are objects of `cortado.gradients`, by default `cortado.gradients.Exact`.
+    Omitted parameters have the scene's values, including schedules. Methods take ``parameters``, a dictionary of values
+    by parameter name. The arguments ``gradient`` and ``estimator`` are objects of `cortado.gradients`, by default
+    `cortado.gradients.Exact`.
 
     Example::
 
@@ -142,7 +142,8 @@ class Problem:
         The backward pass computes the remaining states again.
 
         ``state`` is the first state, or a list with one first state for each scene of a batch; see `Simulation.state`.
-        If ``state`` is given, parameters apply to the steps after it, and initial values are not accepted.
+        With a given ``state``, parameters apply to the steps after it, and parameters for initial values raise an
+        error.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
@@ -169,7 +170,8 @@ class Problem:
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """Return the loss at ``parameters``: a number, or (batch,) for a batch, with NaN for scenes in ``lost``."""
+        """Return the loss at ``parameters``: a number, or an array (batch,) for a batch of scenes. The loss is NaN for
+        scenes in `lost`."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
@@ -178,7 +180,8 @@ class Problem:
 
     @in_turn
     def states(self, parameters: Values, steps: Iterable[int]) -> dict[int, Any]:
-        """Return states of a run with ``parameters``, by their numbers of ``steps``; 0 is the first state."""
+        """Return states of a run with ``parameters``, in a dictionary by step number. ``steps`` are the step numbers of
+        the states; 0 is the first state."""
         return self._ends(self._checked(parameters), check_step_numbers(steps, self.steps), keep=False)
 
     @in_turn
@@ -200,8 +203,8 @@ class Problem:
         """Return the loss and its derivatives with respect to ``parameters`` and with respect to the first state.
 
         The loss and its derivatives with respect to parameters are as in `value_and_gradient`. The derivatives with
-        respect to the state are a table of float64 arrays by field name, with ``time``. For a batch, each array has a
-        first axis for the scenes.
+        respect to the state are a dictionary of float64 arrays by field name, with ``time``. For a batch, each array
+        has a first axis for the scenes.
         """
         forward_pass = self.forward_pass(parameters)
         return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
@@ -227,7 +230,8 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Run forward and return the run, for later backward passes. It keeps the stored states in memory."""
+        """Run forward and return the run, for later backward passes. The returned run keeps its stored states in
+        memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -237,7 +241,8 @@ class Problem:
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:
-        """Return the derivative of the loss along ``directions``, tangents by name, by forward mode, as in `value`."""
+        """Return the derivative of the loss along ``directions``, which are tangents by parameter name, computed in
+        forward mode. The derivative has the shape of the loss in `value`."""
         dots: dict[int, Arrays] = {}
 
         def observe(step: int, dot: State) -> None:
@@ -256,10 +261,10 @@ class Problem:
     def tangents(
         self, parameters: Values, directions: Values, observe: Observer, steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run in forward mode, and return a table of the states after the given numbers of ``steps``.
+        """Run in forward mode. Return a dictionary of the states after the given numbers of ``steps``.
 
-        ``directions`` maps names of parameters to tangents. ``observe`` is called with the number and the tangent of
-        every state. The next step overwrites the tangent.
+        ``directions`` are tangents by parameter name. ``observe`` is called with the number and the tangent of every
+        state. The next step overwrites the tangent.
         """
         return self.several_tangents(parameters, [(directions, observe)], steps)
 
@@ -267,7 +272,7 @@ class Problem:
     def several_tangents(
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
-        """Run once in forward mode along several directions, and return a table of the states after the given numbers
+        """Run once in forward mode along several directions. Return a dictionary of the states after the given numbers
         of ``steps``. ``each`` yields pairs of directions and an observer, as in `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for pair in each if isinstance(each, Iterable) else [each]:
@@ -284,8 +289,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Return tangents of ``quantities`` by name, in the state ``end`` of the last run. ``dot`` is the tangent of
-        the state by field name; ``directions`` are the tangents of the parameters."""
+        """Return the tangents of ``quantities`` by name, at the state ``end`` of the last run. ``dot`` is the tangent
+        of the state by field name. ``directions`` are tangents by parameter name."""
         names = list(quantities)
         if not names:
             return {}
@@ -295,7 +300,7 @@ class Problem:
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:
-        """Errors of the scenes of a batch that lost a particle in the last evaluation, by scene number."""
+        """Errors of the scenes that lost a particle in the last evaluation of a batch, by scene number."""
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
@@ -308,7 +313,7 @@ class Problem:
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at several ``points``, which are computed as one batch; see `Batchable.together`."""
+        """Return estimates at several ``points``, computed as one batch; see `Batchable.together`."""
         require_points(points)
         if estimator is not None:
             checked_reverse(estimator)
@@ -322,14 +327,16 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """Return a problem that begins at the given ``state``. It shares this problem's arrays."""
+        """Return a problem that begins at the given ``state``. The returned problem shares the arrays of the original
+        problem."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
         return found
 
     def batch_of(self, size: int) -> "Problem":
-        """Return this problem for a batch of ``size`` scenes. The problems of the last few sizes are kept."""
+        """Return this problem for a batch of ``size`` scenes. The returned problems for the last few sizes are
+        cached."""
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))
@@ -342,8 +349,9 @@ class Problem:
     def fingerprint(self) -> str:
         """Text that identifies the problem, for checkpoints.
 
-        It includes steps, precision, scene, first positions, free energy, user-defined forces and the solver. The loss
-        is identified by its ``fingerprint`` or the code of its function, or else only by its type.
+        The text depends on steps, precision, scene, first positions, free energy, user-defined forces and solver. The
+        loss is identified by its ``fingerprint`` or the code of its function. A loss without either is identified by
+        its type.
         """
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {
@@ -363,12 +371,14 @@ class Problem:
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
 
     def iterations(self) -> np.ndarray:
-        """Return the pressure iterations (steps,) of the last evaluation, for solvers with a single iteration loop."""
+        """Return the number of pressure iterations in each step (steps,) of the last evaluation, for solvers with a
+        single iteration loop."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics (steps,) of the last evaluation by name, such as ``converged``. Names depend on the solver."""
+        """Diagnostics of each step (steps,) in the last evaluation, by name, such as ``converged``. The names depend on
+        the solver."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:

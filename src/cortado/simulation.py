@@ -1,4 +1,4 @@
-"""The class `Simulation`: a scene prepared to run on a device in a precision."""
+"""The class `Simulation`: a scene prepared to run on one device in one precision."""
 
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
@@ -54,7 +54,8 @@ Start = RestartState | Sequence[RestartState]
 class Simulation(Stepping):
     """A scene prepared to run.
 
-    One thread at a time may use a simulation. It can be pickled and used after a fork; see `docs/processes.md`.
+    One thread at a time may use a simulation. A simulation can be pickled and used after a fork; see
+    `docs/processes.md`.
 
     Example::
 
@@ -119,11 +120,12 @@ class Simulation(Stepping):
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """Positions of wall particles (b, d) [m], and `wall_numbers` of their solids (b,), or -1 for the container."""
+        """Positions of wall particles (b, d) [m], and the number of each wall particle's solid (b,) from
+        `wall_numbers`, or -1 for the container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
         """Constants of the rest lattice, and initial and prescribed masses of the fluid [kg]."""
         self.free_particles = discrete.fluid.emitted.start
-        """Number of particles that do not start in an emitter. Arrays contain these particles first."""
+        """Number of particles that do not start in an emitter. In arrays, particles of emitters come last."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
         self.solver: Solver = build.built(self._maker, build.SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
@@ -136,7 +138,8 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver if only it can continue from its states, which have additional fields, else None."""
+        """Name of the solver if its states have additional fields, else None. Only this solver can continue from such
+        states."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -174,26 +177,27 @@ class Simulation(Stepping):
         time: float | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run from the initial state of the scene and return a trajectory. Its frames are the first state, every
-        ``record_every``-th state and the last state. A batch returns a `TrajectoryBatch`.
+        """Run from the initial state of the scene and return a trajectory. The frames of the trajectory are the first
+        state, every ``record_every``-th state and the last state. A batch returns a `TrajectoryBatch`.
 
         Args:
             steps: number of steps.
-            controls: parameters by name, such as ``{"gravity": [0.0, -5.0]}``, (d,) or (steps, d) [m/s2]. They
+            controls: parameters by name, such as ``{"gravity": [0.0, -5.0]}``, (d,) or (steps, d) [m/s2]. Controls
                 replace the values of the scene and its schedule. All parameters of `Problem` are possible.
             record_every: number of steps between frames.
             state: the ``last_state`` of an earlier trajectory, or a sequence with one state for each scene of a
-                batch. The run continues exactly (bit for bit). Parameters over time then need a value for each
+                batch. The run continues exactly (bit for bit). Time-dependent parameters then need a value for each
                 further step. A rest density that was given to the earlier run must be given again.
             record: names of particle quantities that are stored with every frame, such as ``["density"]``; see
                 `quantity`.
-            sensors: sensors by name, in addition to the scene's sensors. They are read in every step; see
+            sensors: sensors by name, in addition to the scene's sensors. All sensors are read in every step; see
                 `cortado.sensors`.
             observe: a function that is called with the number of each step, to show progress.
             time: duration [s] in place of ``steps``. The run ends with the first step that ends at this time or
                 later.
 
-        Warns if the pressure did not converge, and if a scene of a batch is lost. A single run raises `DivergedError`.
+        Warns if the pressure did not converge. A lost particle causes a warning in a batch, and a `DivergedError` in a
+        single run.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one
@@ -242,16 +246,16 @@ class Simulation(Stepping):
         return found
 
     def frame(self, state: State) -> dict[str, np.ndarray]:
-        """Return the fields of a ``state`` that steps change."""
+        """Return the fields of a ``state`` that change from step to step."""
         return state.numpy(self.dimension, [field.name for field in self.initial.fields if not field.is_constant])
 
     def numbers_in_frame(self, components: int) -> int:
-        """Return the count of numbers in a `frame`, where each vector has ``components`` components."""
+        """Return how many numbers a `frame` contains if each vector has ``components`` components."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
     def constants(self, rollout: Rollout) -> dict[str, np.ndarray]:
-        """Return the fields of the states of a ``rollout`` that steps do not change."""
+        """Return the fields that are equal in all states of a ``rollout``."""
         names = [field.name for field in rollout.initial.fields if field.is_constant]
         return rollout.initial.numpy(self.dimension, only=names)
 
@@ -333,7 +337,8 @@ class Simulation(Stepping):
 
         Raises:
             SceneError: settings are invalid.
-            InputError: the quantity of ``colour`` is not recorded in the frame. The age needs several frames.
+            InputError: the frame does not contain the quantity of ``colour``. For the colour "age", use
+                `Trajectory.picture`.
 
         Example: ``cortado.pictures.write_picture("last.png", simulation.picture(trajectory[-1]))``
         """
@@ -364,8 +369,8 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """Return the number of runs of ``steps`` steps that should be computed together. They fit into half of the free
-        memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
+        """Return how many runs of ``steps`` steps should be computed together. The data of these runs fit into half of
+        the free memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
         steps, most = whole_number("steps", steps, 0), as_one_number("checkpoints", checkpoints)
         neighbours, real = build.first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
@@ -381,10 +386,10 @@ class Simulation(Stepping):
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
-        """Return the stable number of explicit diffusion substeps in each ``time_step`` [s].
+        """Return the smallest stable number of explicit diffusion substeps in each ``time_step`` [s].
 
         ``mobility`` is in m2/s, ``interface_width`` in m, and ``rest_density`` (phases,) in kg/m3. Raises `InputError`
-        for more than `cortado.sph.free_energy.MOST_SUBSTEPS`.
+        if the number exceeds `cortado.sph.free_energy.MOST_SUBSTEPS`.
         """
         if len(self.scene.phase) == 1:
             return 0

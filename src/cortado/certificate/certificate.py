@@ -1,4 +1,5 @@
-"""Certificates say whether gradients are right, up to which step they are useful, and what suits longer runs."""
+"""Certificates say whether gradients are right, up to which step they are useful, and which estimator suits longer
+runs."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -39,14 +40,16 @@ from cortado.simulation import Simulation
 
 Random = np.random.Generator
 BESIDE = 0.1 * PERTURBATION
-"""Size of random changes of the initial positions [spacings] and initial velocities [speeds of a fall]."""
+"""Size of small random changes of the initial state. Positions change relative to the spacing, and velocities relative
+to the speed of a fall over the fluid's height."""
 ROUGHLY = 0.1
 """Greatest accepted relative difference between the adjoint and the finite differences of a float32 loss."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: whether the adjoint is right, for how many steps it is useful, and what to use."""
+    """The result of `certify`: whether the adjoint is right, for how many steps it is useful, and which estimator to
+    use."""
 
     particles: int
     steps: int
@@ -56,7 +59,8 @@ class Certificate:
     loss_changes: dict[str, float]
     """Predicted change of the loss for a meaningful perturbation of each parameter."""
     consistency: Consistency
-    """Comparison of the derivatives by reverse mode, forward mode and differences, for all parameters together."""
+    """Comparison of the derivatives by reverse mode, forward mode and finite differences, for all parameters
+    together."""
     wrong: tuple[str, ...]
     """Names of the parameters with a wrong derivative. Empty if all derivatives are right."""
     norms: np.ndarray
@@ -68,9 +72,10 @@ class Certificate:
     alignment: Alignment | None
     """Comparison of each estimator's gradient with the smoothed gradient, or None without a smoothed gradient."""
     beside: Consistency | None = None
-    """Comparison after small random moves of the particles. None unless the first state is on a corner."""
+    """Comparison of the derivatives after small random changes of the initial state. None if the loss has no corner at
+    the initial state."""
     beyond: tuple[str, ...] = ()
-    """Sentences on questions that remain open because a particle was lost."""
+    """Sentences that say which steps could not be checked because a particle was lost."""
 
     def __repr__(self) -> str:
         verdict = f"right, horizon {self.horizon}" if self.right else f"WRONG for {', '.join(self.wrong)}"
@@ -158,7 +163,7 @@ def certify(
     """Check the gradients of a problem or a scene in float64.
 
     A float32 problem is rebuilt in float64 on the same device, because round-off would hide errors. A user-defined loss
-    is still computed in float32. Its adjoint may differ from its finite differences by a tenth.
+    is still computed in float32. The adjoint of such a loss may differ from its finite differences by 10 %.
 
     The adjoint is checked with respect to all parameters of the scene. The horizon and the recommended estimator are
     computed for ``parameters`` only. The horizon is the number of steps up to which the exact gradient is useful.
@@ -166,11 +171,11 @@ def certify(
     Args:
         problem: a problem, a simulation, a scene, or the path of a scene file. Without a problem, ``steps`` is
             required, and the loss is the mean squared displacement of the particles.
-        parameters: values by name, or names of parameters. Names stand for the values in the scene.
+        parameters: values by name, or names of parameters. A parameter without a value has its value in the scene.
         perturbation: size of a meaningful perturbation, relative to the parameter's value. Positions are perturbed
             relative to the spacing, and velocities relative to the speed of a fall over the fluid's height.
         seed: seed of the random directions.
-        steps: number of steps. It must be left out if ``problem`` is a `Problem`.
+        steps: number of steps. Leave out ``steps`` if ``problem`` is a `Problem`.
 
     If a particle is lost during the checks, the results cover only the earlier steps, and `Certificate.beyond` says so.
     Raises `InputError` for unsuitable arguments, and `DivergedError` if the problem itself diverges.
@@ -262,7 +267,8 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """Check all parameters together, or else each alone. Return the check and the names of the wrong parameters."""
+    """Check all parameters together, and each parameter alone if this check fails. Return the check of all parameters,
+    and the names of the parameters with a wrong derivative."""
     together = check_consistency(history, values, gradient, along)
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
@@ -271,10 +277,11 @@ def _consistency(
 
 
 def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> tuple[Consistency | None, int]:
-    """Check the derivatives after small random changes of the initial positions and velocities. Return the check and
-    its number of steps, or None and 0 if a particle is lost at once.
+    """Check the derivatives after small random changes of the initial positions and velocities. Also return the number
+    of checked steps.
 
-    In fluid at rest the loss may have a corner, due to terms such as |v|. The adjoint is then a one-sided derivative.
+    In fluid at rest the loss may have a corner, because terms such as |v| have a corner at velocity v = 0. The adjoint
+    is then a one-sided derivative.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
@@ -295,7 +302,8 @@ WIDTH = 110
 
 
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
-    """Describe how many digits of both modes and central differences agree, and whether the loss has a corner."""
+    """Describe how many digits of reverse mode, forward mode and central differences agree, and whether the loss has a
+    corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"

@@ -23,7 +23,8 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Return the problem of the first ``steps`` steps, with the frames within them, or None if nothing remains."""
+    """Shorten a problem to its first ``steps`` steps. Returns None if no step, or no frame of a `Frames` loss,
+    remains."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -86,14 +87,14 @@ class Rounded:
 
 SAMPLE_STEPS = 25
 ROUGH = (1e-1, 1e-2, 1e-3)
-"""Step sizes of the central differences of a float32 loss, relative to the direction."""
+"""Step sizes of the central differences of a float32 loss, as multiples of the direction."""
 FLOAT32_ROUND_OFF = 1e-6
 ABOVE_ROUND_OFF = 30.0
 """Least usable difference between two float32 losses, relative to their round-off."""
 
 
 class LossHistory:
-    """A problem with its loss after several numbers of steps, or after those of the frames of a `Frames` loss."""
+    """The loss of a problem after several numbers of steps. A `Frames` loss is computed at the steps of its frames."""
 
     def __init__(self, problem: Problem):
         loss, steps = problem.loss, problem.steps
@@ -108,9 +109,9 @@ class LossHistory:
         self._total = np.cumsum if frames else np.asarray
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the central differences (sample_steps,) with step size ``h``, and the distances (sample_steps,)
-        between the two one-sided differences. Central differences are NaN after a run diverges. The distances are 0 for
-        float32 losses."""
+        """Return the central differences of the loss (sample_steps,) with step size ``h``. Also return the distances
+        (sample_steps,) between the forward and the backward difference. Central differences are NaN after a run
+        diverges. The distances are 0 for float32 losses."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -137,7 +138,8 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """Yield the losses, and the states of runs with ``-h`` and ``h`` times the direction, until a run diverges."""
+        """Run twice, with the parameters moved by ``-h`` and by ``h`` times a direction. Yield each loss with the
+        states of both runs, until a run diverges."""
         moved = ({name: parameters[name] + step * d for name, d in along.items()} for step in (-h, h))
         behind, ahead = (self._reached({**parameters, **one}) for one in moved)
         for step, loss in self._losses.items():
@@ -145,7 +147,8 @@ class LossHistory:
                 yield loss, behind[step], ahead[step]
 
     def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
-        """Return the states at the sample steps before the loss of a particle, none if the run cannot begin."""
+        """Return the states at the sample steps before a particle is lost. No states are returned if the run cannot
+        begin."""
         try:
             return self.problem.states(parameters, self._losses)
         except NO_RUN as error:
@@ -182,7 +185,8 @@ class LossHistory:
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """Return a loss's change between two states from the mean of both adjoints, without round-off, to second order."""
+    """Return the change of a loss between two states, to second order. The change is computed from the mean of the
+    adjoints at both states, which avoids round-off."""
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
@@ -193,7 +197,7 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
 
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
-"""Step sizes of the central differences, relative to the direction, in the order of use."""
+"""Step sizes of the central differences, as multiples of the direction, in the order of use."""
 MODE_TOLERANCE = 1e-8
 """Greatest accepted relative difference between reverse and forward mode in float64."""
 PLATEAU = 1e-3
@@ -201,13 +205,14 @@ PLATEAU = 1e-3
 CORNER = 1e-4
 """Least relative difference between the two one-sided slopes at a corner of the loss."""
 SLACK = 10.0
-"""Greatest accepted distance of forward mode from a difference, relative to that of two successive differences."""
+"""Greatest accepted distance between forward mode and a central difference, relative to the distance between two
+successive central differences."""
 RESOLUTION = 1e-6
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 FAINT = 1e-4
-"""Least effect of a parameter on the loss that `balanced` considers, relative to the strongest parameter's effect."""
+"""Effect on the loss below which `balanced` ignores a parameter, relative to the strongest parameter's effect."""
 ROUND_OFF = 1e-13
-"""Directional derivative that counts as 0, relative to the loss."""
+"""Greatest directional derivative that counts as 0, relative to the loss."""
 DIFFERENCE_ROUND_OFF = 1e-15
 """Round-off of a central difference, relative to the loss divided by the step size."""
 
@@ -219,19 +224,20 @@ class Consistency(ShortRepr):
     sample_steps: np.ndarray
     """Numbers of steps (sample_steps,) after which the loss is computed."""
     losses: np.ndarray
-    """Losses (sample_steps,)."""
+    """Loss after each sample step (sample_steps,)."""
     adjoint: float
     """Directional derivative of the last loss by reverse mode."""
     size: float
-    """Norm of the elementwise product of gradient and direction. It is the scale of round-off in ``adjoint``."""
+    """Norm of the elementwise product of gradient and direction, which is the scale of round-off in ``adjoint``."""
     tangents: np.ndarray
     """Directional derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps) by step size. Empty if reverse and forward mode already differ."""
+    """Central differences (tried, sample_steps) for each tried step size. Empty if reverse and forward mode
+    disagree."""
     sides: np.ndarray
-    """Distances (tried, sample_steps) between the two one-sided differences, for each step size."""
+    """Distances (tried, sample_steps) between the forward and the backward difference, for each tried step size."""
     steps: np.ndarray
-    """Step sizes (tried,) of the differences, relative to the direction."""
+    """Tried step sizes (tried,) of the central differences, as multiples of the direction."""
 
     @property
     def disagreement(self) -> float:
@@ -243,24 +249,27 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative differences (tried - 1, sample_steps) between central differences with successive step sizes, plus
-        round-off. Each value is the maximum over the sample steps so far."""
+        """Relative differences (tried - 1, sample_steps) between central differences with successive step sizes.
+        Round-off is added to the differences. Each value is the maximum over the sample steps up to its own."""
         round_off = DIFFERENCE_ROUND_OFF * np.abs(self.losses).max() / self.steps[1:, None]
         return self._worst(np.abs(np.diff(self.differences, axis=0)) + round_off)
 
     @property
     def misses(self) -> np.ndarray:
-        """Relative distances (tried, sample_steps) of differences from forward mode, at most so far."""
+        """Relative distances (tried, sample_steps) between central differences and forward mode. Each value is the
+        maximum over the sample steps up to its own."""
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
     def corner(self) -> np.ndarray:
-        """Least relative distances (sample_steps,) of both one-sided differences, 0 without a corner."""
+        """Relative distance (sample_steps,) between the forward and the backward difference, least over all step sizes.
+        The distance is about 0 if the loss has no corner."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
     def is_on_a_corner(self) -> bool:
-        """True if the loss has a corner: both modes agree, but the one-sided differences have different limits."""
+        """True if the loss has a corner. Reverse and forward mode then agree, but the forward and the backward
+        difference have different limits."""
         slopes = self.corner[self.converged]
         return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
@@ -271,20 +280,21 @@ class Consistency(ShortRepr):
 
     @property
     def last_converged(self) -> int | None:
-        """Last sample step at which the differences converge, or None."""
+        """Last sample step at which the central differences converge, or None."""
         return int(self.sample_steps[self.converged][-1]) if self.converged.any() else None
 
     @property
     def miss(self) -> float | None:
-        """Least relative distance of forward mode from a difference at the last converged sample step, or None."""
+        """Relative distance between forward mode and the nearest central difference, at the last converged sample step.
+        None if the central differences converge at no sample step."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
     def differences_agree(self) -> bool:
         """True if forward mode agrees with the central differences wherever the central differences converge.
 
-        The allowed distance is `SLACK` times the least distance of two successive differences. At a corner of the loss
-        it is the distance between the two one-sided differences.
+        The allowed distance is `SLACK` times the least distance between two successive central differences. At a corner
+        of the loss, the allowed distance is the distance between the forward and the backward difference.
         """
         allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
         near = self.misses.min(axis=0, initial=np.inf) <= np.maximum(allowed, self.corner)
@@ -317,7 +327,7 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
 
 
 def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, directions: Arrays) -> Consistency:
-    """Compare derivatives along `balanced` directions; ``gradient`` has those of reverse mode."""
+    """Compare directional derivatives along `balanced` directions. ``gradient`` is the gradient by reverse mode."""
     along = balanced(gradient, directions)
     losses, tangents, _ = history.tangent(values, along)
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])

@@ -17,11 +17,12 @@ from cortado.scene.parameter_values import Arrays, Values
 from cortado.scene.parameters import Axis, Parameter, Range, Role
 
 PERTURBATION = 0.05
-"""Size of a meaningful perturbation, relative to a parameter, the spacing, or the speed of a fall."""
+"""Size of a meaningful perturbation, relative to the parameter's value. Positions are perturbed relative to the
+spacing, and velocities relative to the speed of a fall over the fluid's height."""
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
-    """Return the values of parameters, given as a table of values or as names."""
+    """Return the values of the requested parameters. ``parameters`` has values by name, or only names."""
     simulation = problem.simulation
     if problem.state is not None:
         said = "problem begins at a state, but must begin as its scene does"
@@ -50,8 +51,8 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Return the values of all parameters that affect the run and can be both increased and decreased. Missing values
-    come from the scene. Parameters over time have a value for each step."""
+    """Return the values of all parameters that affect the run and can be both increased and decreased. Values that are
+    not in ``chosen`` come from the scene. Parameters that vary over time have a value for each step."""
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
     for name, value in values.items():
@@ -70,21 +71,22 @@ def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
-    """Return the size of a meaningful perturbation of each parameter, in the parameter's shape and unit. The size is a
-    fraction of the parameter's value, of the spacing, or of the speed of a fall."""
+    """Return the size of a meaningful perturbation of each parameter, in the parameter's shape and unit. The size is
+    proportional to the parameter's value, to the spacing for positions, or to the speed of a fall for velocities."""
     known = problem.simulation.known
     sizes = {name: perturbation * known[name].change(problem.simulation, value) for name, value in values.items()}
     return {name: np.broadcast_to(size, values[name].shape) for name, size in sizes.items()}
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return a random direction of the given size for each parameter, which is positive for scalars."""
+    """Return a random direction of the given size for each parameter. The direction of a scalar is positive."""
     drawn = {name: random.standard_normal(value.shape) if value.ndim else 1.0 for name, value in values.items()}
     return {name: sizes[name] * part for name, part in drawn.items()}
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions that are smooth in space and constant in time. Directions of fixed paths grow from 0."""
+    """Return random directions that are smooth in space and constant in time. The direction of a displacement over time
+    grows from 0."""
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
@@ -103,7 +105,8 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Return the growth of an adjoint from the last state to the first [e-folds], by a line through log ``norms``."""
+    """Return the growth of an adjoint from the last state back to the first [e-folds]. The growth is found from a line
+    fitted to the logarithms of ``norms``."""
     steps = len(norms) - 1
     total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
     there = np.flatnonzero(total > 0.0)
@@ -117,20 +120,20 @@ def growth(norms: np.ndarray, time_step: float) -> float:
 WITHIN = 0.25
 """Greatest relative difference between a useful exact derivative and the finite difference."""
 LINEAR = 0.3
-"""Greatest relative displacement of neighbours in a good linear approximation of their forces [spacings]."""
+"""Relative displacement of neighbours up to which a linear approximation of their forces is good [spacings]."""
 
 
 @dataclass(frozen=True, repr=False)
 class Horizon(ShortRepr):
-    """The derivatives of the loss for a meaningful perturbation of one parameter: exact and by a difference."""
+    """Exact derivatives and finite differences of the loss for a meaningful perturbation of one parameter."""
 
     parameter: str
     sample_steps: np.ndarray
     """Numbers of steps (sample_steps,) after which the loss is computed."""
     exact: np.ndarray
-    """Derivatives (sample_steps,) by forward mode."""
+    """Exact derivatives (sample_steps,) by forward mode."""
     difference: np.ndarray
-    """Central differences (sample_steps,) over the full perturbation. They are NaN after one of the runs diverges."""
+    """Central differences (sample_steps,) over the full perturbation, or NaN after one of the two runs diverges."""
     strain: np.ndarray
     """First-order change of nearest neighbours' distances by the perturbation (sample_steps,) [spacings]."""
 
@@ -141,7 +144,8 @@ class Horizon(ShortRepr):
 
     @property
     def measured(self) -> int:
-        """Last sample step at which the exact derivative is useful, as at the previous sample step, or 0."""
+        """Last sample step at which the exact derivative is useful. The derivative must also be useful at the previous
+        sample step. The result is 0 without such a step."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
@@ -177,13 +181,13 @@ SAMPLES = 2
 LEAST_COSINE = 0.5
 """Least cosine between a recommended estimator's gradient and the smoothed gradient."""
 GOOD_COSINE = 0.95
-"""Cosine below which ensemble averages are also tried. They cost ten times as much."""
+"""Cosine below which ensemble averages are also tried, although ensemble averages cost ten times as much."""
 ESTIMATORS: tuple[GradientEstimator, ...] = (Exact(), AdjointViscosity())
 AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
     "EnsembleMean(spread)": lambda spread: EnsembleMean(spread, seed=1, estimator=AdjointViscosity()),
     "Guided(spread)": lambda spread: Guided(spread, seed=1),
 }
-"""Ensemble estimators to try. They use different random numbers than the smoothed gradient."""
+"""Ensemble estimators to try, with other random numbers than the smoothed gradient."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +202,8 @@ class Judged:
 
     @property
     def merit(self) -> float:
-        """Cosine divided by the factor between the two gradients' sizes. A perfect gradient has the merit 1."""
+        """Cosine between the estimator's gradient and the smoothed gradient, multiplied by the ratio of the smaller
+        norm to the larger norm. A perfect gradient has the merit 1."""
         return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
 
 
@@ -208,7 +213,7 @@ class Alignment:
     """Relative standard error of the smoothed gradient."""
     estimators: tuple[Judged, ...]
     spread: Mapping[str, float] = field(default_factory=dict)
-    """Spread of the smoothed gradient and of ensemble averages, by parameter name."""
+    """Size of the random changes in the smoothed gradient and in ensemble averages, by parameter name."""
 
     @property
     def best(self) -> Judged | None:

@@ -40,7 +40,8 @@ STEPS = 200
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Return a decorator that adds a function to a group of commands. --quiet hides texts that are no ``answers``."""
+    """Return a decorator that adds a function to a group of commands. The option --quiet hides the returned text,
+    unless ``answers`` is true."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -112,7 +113,8 @@ ALL_FRAMES = FrameOptions()
 
 @dataclass(frozen=True)
 class Where:
-    """The options --scheduler and --workers of a command. Raises `InputError` for both of them or too many workers."""
+    """The options --scheduler and --workers of a command. Raises `InputError` if both are given, or if there are too
+    many workers."""
 
     scheduler: str | None = None
     """Address of a Dask scheduler."""
@@ -132,7 +134,7 @@ class Where:
 
     @contextmanager
     def executor(self, device: str, items: int) -> "Iterator[Executor]":
-        """Yield the executor for ``items`` computations: Dask's, local workers with a GPU each, or this process."""
+        """Yield the executor for ``items`` computations: a Dask scheduler, local worker processes, or this process."""
         from cortado.executors import Distributed, InProcess, local_workers
 
         if self.scheduler is not None:
@@ -166,7 +168,8 @@ def require_one_of_both(resume: bool, overwrite: bool) -> None:
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, by default `STEPS`, or None with a time [s]. Raises `InputError` for both."""
+    """Return the number of steps, which is `STEPS` by default. If a time [s] is given, return None. Raises `InputError`
+    if steps and time are both given."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:
@@ -177,7 +180,7 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
 
 
 def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the values of --set as text. Raises `SceneError` if the file is unreadable or has no such key."""
+    """Return the values of --set as text. Raises `SceneError` if the file is unreadable or lacks a key."""
     words = as_text(overrides)
     read_toml(file, words)
     return words

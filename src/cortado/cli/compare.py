@@ -1,4 +1,5 @@
-"""The commands ``cortado compare``, of two runs or of a run and measured data, and ``cortado convergence``."""
+"""The command ``cortado compare``, which compares two runs, or a run with measured data. Also the command ``cortado
+convergence``."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,7 @@ from cortado.runs.sensor import measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
 IGNORED = ("command", "started", "resumed", "settings", "kind")
-"""Keys of environment.json that are not compared here."""
+"""Keys of environment.json that ``cortado compare`` ignores."""
 SAME_TIME = 1e-9
 """Relative difference below which two times count as equal."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
@@ -32,7 +33,8 @@ LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
 LOWEST, HIGHEST = 0.5, 2.0
 """Range of trusted orders of convergence."""
 SAFE, UNSURE = 1.25, 3.0
-"""Safety factors of Roache (1994): with three sizes and a trusted order, and without."""
+"""Safety factors of the estimated error (Roache 1994). The first factor holds for a trusted order of convergence, and
+the second factor for any other case."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
@@ -71,7 +73,6 @@ def _table(value: Any) -> dict[str, Any]:
 
 
 def _metrics(one: RunFolder, other: RunFolder, settings: list[dict[str, Any]], scenes: list[Any]) -> dict[str, Any]:
-    """Return the first line that differs, and the greatest differences over all lines, or a note for other times."""
     steps = [_table(scene.get("solver")).get("time_step") for scene in scenes]
     same = steps[0] == steps[1] and (steps[0] != "auto" or scenes[0] == scenes[1])
     if not same and all(table["kind"] == "run" for table in settings):
@@ -92,7 +93,7 @@ def _metrics(one: RunFolder, other: RunFolder, settings: list[dict[str, Any]], s
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Compare the fields of the last two frames at the same time. Returns None if a run has no frames."""
+    """Compare the fields of two runs in their last frames with equal times. Returns None if a run has no frames."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -196,7 +197,7 @@ class Resolved:
         """End time of the run [s]."""
         masses = last.constants["reference_density"].astype(np.float64)
         self.mass = float(masses.sum()) * float(self.scene["discretisation"]["spacing"]) ** last.dimension
-        """Mass of the fluid [kg]. In 2-D it is the mass of a layer 1 m thick."""
+        """Mass of the fluid [kg], in 2-D of a layer 1 m thick."""
         numbers = {f"{kind} energy": ("J", float(result["energy"]["last"][kind])) for kind in ("kinetic", "potential")}
         if self.scene.get("emitter") or self.scene.get("drain"):  # in which particles rest far from the fluid
             masses = masses * is_out(folder.read_scene(), last[0].others, len(masses))
@@ -252,7 +253,8 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
-    """Return the key in which the runs differ, spacing or time step. Raises `InputError` if any other differs."""
+    """Return the key of the scene that differs between the runs: the spacing or the time step. Raises `InputError` if
+    other keys differ."""
     changed: set[str] = set()
     for run in runs[1:]:
         changed |= differences(runs[0].scene, run.scene).keys()
@@ -284,23 +286,24 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """The extrapolation of a result to the limit of vanishing spacing or time step. The model is f(h) = limit + C
-    h^order for the value f at the size h, with an unknown constant C. It is fitted to the three finest sizes.
+    """The extrapolation of a result to the limit of vanishing spacing or time step. The model for the result f at size
+    h is f(h) = limit + C h^order, with an unknown constant C. The model is fitted to the three finest sizes.
 
     Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911), 307; the grid convergence index of P. J. Roache, J.
     Fluids Eng. 116 (1994), 405; for sizes with different ratios, I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001.
-    Without an observed order, the error is three times the greatest difference: L. Eca and M. Hoekstra, J. Comput.
-    Phys. 262 (2014), 104.
+    Without an observed order, the error is three times the greatest difference between the three results: L. Eca and M.
+    Hoekstra, J. Comput. Phys. 262 (2014), 104.
     """
 
     order: float | None
     """Observed order of convergence, or None if the values do not converge."""
     limit: float | None
-    """Limit for vanishing size, or None. The order is clipped to the range from `LOWEST` to `HIGHEST`."""
+    """Extrapolated value for vanishing spacing or time step, or None. The extrapolation clips the order to the range
+    from `LOWEST` to `HIGHEST`."""
     error: float | None
     """Estimated error of the value at the finest size, including a safety factor. None if a value is NaN."""
     flag: str = ""
-    """Reason for a missing or untrusted order. Empty in the asymptotic range."""
+    """Reason why the order is missing or not trusted. Empty if the order is trusted."""
 
     @classmethod
     def of(cls, sizes: Sequence[float], values: Sequence[float]) -> "Extrapolation":

@@ -1,4 +1,5 @@
-"""The commands ``cortado describe``, of a scene and what its run costs, and ``cortado gradients check``."""
+"""The command ``cortado describe``, which describes a scene and the cost of its run. Also the command ``cortado
+gradients check``."""
 
 import json
 import math
@@ -43,13 +44,14 @@ from cortado.solvers.particles import ParticleSolver
 from cortado.watching import Watch
 
 FIRST_STEPS, MOST_STEPS, ENOUGH = 4, 100, 0.5
-"""Least and greatest number of timed steps, and sufficient time for timing [s]."""
+"""Least and greatest number of timed steps, and the computing time after which no more steps are timed [s]."""
 SAME = 1e-6
 """Relative tolerance for time steps that are rounded to float32."""
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Time some steps. Return their number and the time of one [s]. Raises `DivergedError` if they diverge."""
+    """Measure the computing time of some steps. Return the number of steps and the time per step [s]. Raises
+    `DivergedError` if the run diverges."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -74,7 +76,7 @@ class RunLength:
         self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
         """Number of steps. It is an estimate if the solver chooses the time steps of a run until a given time."""
         self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
-        """Simulated time [s], or None if the solver chooses the time steps of a given number of steps."""
+        """Simulated time [s]. None if the number of steps is given and the solver chooses the time steps."""
         self.frames = frames = choice.count(self.steps, time)
         """Number of recorded frames, including the first and last state, or None if it is unknown."""
         self.trajectory: float | None = None
@@ -84,7 +86,7 @@ class RunLength:
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
             self.trajectory = size + (28e3 + 24.0 * simulation.particles + 50.0 * self.steps)  # headers and diagnostics
         self.film: Pace | None = None
-        """Frames of the film, or None without a film or for an unknown length."""
+        """Number of frames of the film. None if there is no film, or if its length is unknown."""
         if frames is not None and time is not None and 1 < frames <= 1_000_000 and picture.film_frames != 0:
             times = np.linspace(0.0, time, frames)
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
@@ -174,7 +176,8 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the time step [s], its limits [s] by name, and the limit of the first step, or None for a fixed step."""
+    """Return the first time step [s], the limits of the time step [s] by name, and the name of the smallest limit. The
+    name is None for a fixed time step."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -189,7 +192,8 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
 
 
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Describe an emitter: when it is empty, its drains, its speed, and the areas of its cells and opening."""
+    """Describe an emitter: the time at which its supply ends, the drains that feed it, its speed, and the areas of its
+    cells and of its opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
@@ -295,7 +299,8 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Describe a film and the time to draw it. One picture takes ``traced`` or ``quick`` seconds."""
+    """Describe a film and the time to draw it. ``traced`` and ``quick`` are the drawing times of one picture [s] in two
+    qualities."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:

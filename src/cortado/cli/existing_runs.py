@@ -83,7 +83,7 @@ def _told(problem: Exception) -> str:
 
 
 def camera_override(camera: str | None) -> list[str]:
-    """Convert ``--camera`` to an override. It must come before the overrides of ``--set``."""
+    """Convert ``--camera`` to an override. The camera's override must come before the overrides of ``--set``."""
     kind, _, solid = (camera or "").partition(":")
     keys = {"kind": kind, **({"solid": solid} if solid else {})}
     path = ", ".join(f"{name} = {json.dumps(value)}" for name, value in keys.items())

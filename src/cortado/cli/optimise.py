@@ -41,7 +41,8 @@ COUNTED = (
 
 
 def optimise_task(task_file: Path, asked: RunRequest, where: Where = HERE) -> str:
-    """Optimise a task and return a sentence that names the results. ``where`` computes the samples of ensembles."""
+    """Optimise a task and return a sentence that names the results. ``where`` says which processes compute the samples
+    of ensembles."""
     task = load_task(task_file, asked.overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")

@@ -20,7 +20,7 @@ from cortado.scene.scene import scene_in_words
 
 Rows = list[tuple[object, ...]]
 MOST_ERROR = 0.3
-"""Greatest relative error of a found parameter."""
+"""Relative error above which a parameter counts as not found."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ def judge(
 ) -> Verdict:
     """Compare a result with the goals in the task's [optimise.check].
 
-    ``estimate`` has the parameters if the result has only coordinates. ``noise`` is the peak signal-to-noise ratio of
-    the last image [dB]. ``first`` is the initial loss, if it differs from the start of the history.
+    ``estimate`` has the found parameters by name, if ``result`` does not have them. ``noise`` is the peak
+    signal-to-noise ratio of the last image [dB]. ``first`` is the initial loss, if the history does not start with it.
     """
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
@@ -152,7 +152,8 @@ class Solved:
         return found
 
     def _at_knots(self, name: str) -> Iterator[tuple[str, Any, Any, Any]]:
-        """Yield four values for each knot of a parameter: label, first guess, estimate, and hidden value or None."""
+        """Yield the label, the first guess, the estimate and the true value of a parameter at each knot. An unknown
+        true value is None."""
         own = self.knots[name]
         for k, time in enumerate(own.times):
             true = None if own.true is None else own.true[k]
@@ -160,7 +161,8 @@ class Solved:
 
     @property
     def lines(self) -> list[str]:
-        """Lines of text on the parameters or their knots. Parameters with very many components are left out."""
+        """Lines of text with the estimates of the parameters, or of their values at knots in time. Parameters with very
+        many components are left out."""
         lines = []
         for name, value in self.estimate.items():
             found: Iterable[Any] = [(_words(name), None, value, self.made.true_parameter(name))]

@@ -31,12 +31,13 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""Least time between two writes of notes [s], and least ratio of this time to the writing time."""
+"""Least time between two writes of sensor readings and diagnostics [s], and its least ratio to the duration of
+a write."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a command asks of a run, a search or a fit."""
+    """The options of a command for a run, an optimisation or a fit."""
 
     out: Path
     steps: int | None = None
@@ -57,7 +58,7 @@ class RunRequest:
     report: bool = True
 
     def folder(self, scene: Scene, simulation: Simulation, kind: str, settings: dict[str, Any]) -> RunFolder:
-        """Make the folder of the run, or open it for going on."""
+        """Make the folder of the run, or open the folder to resume the run."""
         given = self.out, scene.to_json(), self.command
         noted: dict[str, Any] = {"kind": kind, "settings": settings, "device": str(simulation.device)}
         if self.resume:
@@ -88,7 +89,7 @@ class RunRecording:
     frames: FrameChoice
     watch: Watch
     kept: Trajectory | None = None
-    """Frames of an earlier process, from which the rollout continues."""
+    """Frames that an earlier process recorded, if the run is resumed."""
 
     def go_on(self) -> int:
         """Continue from the last frame in the folder, and return its step number."""

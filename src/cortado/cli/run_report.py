@@ -39,7 +39,8 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of the fluid [J], without particles in emitters and drains. In 2-D they belong to a layer 1 m thick."""
+    """Energies of the fluid [J], without particles in emitters and drains. In 2-D the energies are for a layer 1 m
+    thick."""
 
     kinetic: float
     potential: float
@@ -68,7 +69,7 @@ class RunSummary:
     def __init__(
         self, simulation: Simulation, rollout: Rollout, last: State, seconds: float, readings: Mapping[str, Readings]
     ):
-        """Summarise a run with its ``last`` state, computing time ``seconds`` of this process, and readings."""
+        """Summarise a run from its last state, the computing time of this process [s], and the sensor readings."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings
         self.computed = taken - rollout.progress.step  # without the steps of an earlier process
@@ -183,7 +184,8 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run, with the results ``told``, the readings ``read`` by sensor, and shaded pictures."""
+    """Write the report of a run. ``told`` is the section with the results, and ``read`` has the readings by sensor. If
+    ``pictures`` is true, the report shows shaded pictures."""
     scene, trajectory, step = simulation.scene, Trajectory.load(folder.trajectory), float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
     if scene.solver.chooses:

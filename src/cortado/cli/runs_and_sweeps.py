@@ -54,17 +54,17 @@ def sweep(
     scheduler: str | None = None,
     workers: int | None = None,
 ) -> Work:
-    """Run a scene, or optimise a task, with every combination of some values, each in its own folder. Finished folders
-    are kept.
+    """Run a scene, or optimise a task, with every combination of some values, each in its own folder. Finished runs are
+    not repeated.
 
     Args:
         file: The scene file, or the task file.
         sets: A key and its values, such as solver.time_step=0.001,0.002; several --set make every combination.
         zips: Keys that change together: the first values of all --zip make one run, the second values the next.
-        steps: Number of steps with the smallest time step of the sweep, 200 if left out; all runs end at the same time.
+        steps: Number of steps of the run with the smallest time step, 200 if left out; all runs end at the same time.
         time: Simulated time of a scene [s], instead of steps.
         out: Folder of the sweep, with a folder for each combination and a table of all results.
-        pictures: Leave out the figures and reports of a scene's runs, which take longer than short runs.
+        pictures: Leave out the figures and reports of a scene's runs; drawing them takes longer than a short run.
         device: Device of each worker: "cpu", or "cuda:0" for the first GPU.
         scheduler: Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
@@ -87,7 +87,7 @@ def convergence(
 
     Args:
         runs: Folders of at least three runs that end at the same time, or the folder of a sweep.
-        quantities: An additional number: your own function of a cortado.Trajectory; may be given again.
+        quantities: Your own function of a cortado.Trajectory that returns one more number; may be given again.
     """
     from cortado.cli.compare import convergence_table
 

@@ -199,13 +199,13 @@ def optimise(
     workers: int | None = None,
     pictures: Flag = True,
 ) -> Work:
-    """Optimise the parameters that a task file names, and check the result as the file asks.
+    """Optimise the parameters that a task file names, and check the result against the goals in the file.
 
     Args:
         task: A scene file with the tables [problem] and [optimise].
         out: Folder of the run.
         overrides: Replace a value of the file, such as optimise.iterations=50; may be given again.
-        resume: Continue the run in the folder, bit for bit as without a stop.
+        resume: Continue the stopped run in the folder; its results are the same, bit for bit, as without the stop.
         overwrite: Replace an earlier run in the same folder.
         scheduler: Address of a Dask scheduler, whose workers compute the samples of an ensemble.
         workers: Number of local worker processes for the samples; with "cuda" each worker has its own GPU.

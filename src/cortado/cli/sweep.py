@@ -43,7 +43,8 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """Name of the folder, made of the values. A long or special one is shortened and ends with a checksum."""
+        """Name of the combination's folder, made of the values. A long or special name is shortened and ends with a
+        checksum."""
         name = ",".join(self.overrides)
         is_plain = re.fullmatch(r"[A-Za-z0-9_=,.+-]+", name) and not name.startswith(("-", "."))  # needs no quotes
         if is_plain and len(name) <= _LONGEST_NAME:
@@ -100,7 +101,8 @@ def _split(text: str) -> list[str]:
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the table of folders, values and results, given the contents of result.json by combination number."""
+    """Write the table of a sweep, with the folder, the values and the results of each combination. ``results`` has the
+    contents of result.json by combination number."""
     rows = list[dict[str, Any]]()
     for number, result in sorted(results.items()):
         one, failures = combinations[number], result["failures"]
@@ -116,7 +118,8 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Flatten tables, with names joined by full stops. Short lists become JSON, and long lists are left out."""
+    """Flatten nested dicts, and join their keys with full stops. Short lists become JSON text, and long lists are left
+    out."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
@@ -136,7 +139,7 @@ class Member:
     duration: float | None
     """Duration of a scene's run [s], or None for a task."""
     asked: RunRequest
-    """What all runs have in common, with the folder of the sweep."""
+    """Options that all runs share, including the folder of the sweep."""
     frames: FrameOptions
     """Choice of recorded frames. The default is about a hundred frames."""
 
@@ -153,7 +156,7 @@ class Member:
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
         """Return the result of a combination, or None if its run has not ended. Raises `InputError` if the scene or
-        task is wrong, or if it differs from the file in the folder."""
+        task is wrong, or differs from the scene or task in the folder."""
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)
@@ -204,7 +207,8 @@ class Member:
 def run_sweep(
     file: Path, options: list[str], zipped: list[str], asked: RunRequest, frames: FrameOptions, where: Where
 ) -> str:
-    """Compute the missing combinations, and return a sentence on them. Raises `ComputationError` if some fail."""
+    """Compute the missing combinations of a sweep, and return a summary in words. Raises `ComputationError` if some
+    fail."""
     chosen, duration, out = combinations(options, zipped), asked.time, asked.out.absolute()
     if "optimise" in read_toml(file):  # a task
         own: dict[str, Any] = {"steps": asked.steps, "time": asked.time, "no-pictures": None if asked.report else True}

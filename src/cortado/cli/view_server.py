@@ -104,8 +104,6 @@ class GuardedServer:
             self.viser.stop()
 
     def _serve(self, serve: Callable[..., Any], *where: Any, process_request: Any = None, **options: Any) -> Any:
-        """Open a server by the function ``serve`` of websockets, with own checks."""
-
         def control(name: str) -> Any:  # viser has no public way from the id in a message to its control
             return self.viser.gui._gui_input_handle_from_uuid.get(name)
 

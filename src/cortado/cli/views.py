@@ -309,7 +309,8 @@ class LiveView:
         self.window.show(state["positions"], colours, is_out(scene, state.fields, particles), quantities)
 
     def _controls(self) -> dict[str, np.ndarray]:
-        """Return the controls of the next steps: gravity, and a straight path from each nozzle to its sliders."""
+        """Return the parameters of the next steps: gravity, and the path of each nozzle. A nozzle moves in a straight
+        line to the position of its sliders."""
         controls = {"gravity": np.array([slider.value for slider in self.gravity])}
         share = np.arange(1, self.steps + 1)[:, None] / self.steps
         for name, sliders in self.nozzles.items():

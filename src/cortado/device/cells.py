@@ -94,7 +94,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def place(arrivals, starts, counts, placed, before):
-        """Place each particle at its cell, and reset ``counts`` to 0."""
+        """Write the index of each particle into the sorted array, and reset ``counts`` to 0."""
         i = wp.tid()
         arrival = arrivals[i]
         p = starts[arrival[0]] + arrival[1]

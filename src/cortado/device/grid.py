@@ -14,7 +14,7 @@ class Grid:
     cell: np.ndarray
     """Edge lengths of a cell [m], (3,)."""
     shape: tuple[int, int, int]
-    """Number of cells along each axis. In 2-D it is 1 along z."""
+    """Number of cells along each axis, which is 1 along z in 2-D."""
 
     @property
     def cells(self) -> int:

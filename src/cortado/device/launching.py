@@ -80,8 +80,6 @@ def _found(name: str, sources: Sequence[Named], kernel: wp.Kernel) -> Any:
 
 @cache
 def _signature(kernel: wp.Kernel) -> tuple[dict[str, None], list[tuple[str, Any, list[str]]]]:
-    """Return the names of the arguments, with the arrays of bundles instead of bundles. Also return the name, bundle
-    and arrays of each argument."""
     arguments = []
     for a in kernel.adj.args:
         struct = a.type if a.type.__hash__ and a.type in _FIELDS else None
@@ -139,7 +137,7 @@ def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> 
 
 
 def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
-    """Run several launches that can only be repeated as a whole. Watchers get a single launch."""
+    """Run ``work``, which launches several kernels that can only be repeated together. Watchers get a single launch."""
 
     def unwatched() -> None:
         watchers = _watchers.copy()
@@ -248,7 +246,7 @@ class CapturedGraph:
 
 BANDS = 8
 LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
-"""Least number of threads in a range, and in a frequent launch that is divided into ranges."""
+"""Least number of threads in a range, and least number for which a frequent launch is divided into ranges."""
 
 
 class BandLauncher:
@@ -305,7 +303,8 @@ class HostCopy:
             wp.copy(self._copy, self._array)
 
     def read(self, rows: int | None = None) -> np.ndarray:
-        """Wait for the device, and return the array or its first ``rows`` rows. The next call overwrites the result."""
+        """Wait for the device, and return the array or its first ``rows`` elements. The next call overwrites the
+        result."""
         if not (self._is_cpu or self.is_fetched or rows == 0):
             self.fetch()
             wp.synchronize_stream(self._array.device)

@@ -60,7 +60,7 @@ def by_name(*made: Any) -> SimpleNamespace:
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """Return a kind of kernels, as part of a Warp module's name: "forward", "taped" or "derivative".
+    """Return the kind of kernels for the name of a Warp module: "forward", "taped" or "derivative".
 
     Kernels for Warp's tape have separate modules, because the adjoints of the kernels take long to compile.
     """
@@ -84,7 +84,8 @@ class _Said:
 
 def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
     """Compile all kernels of an object and its parts in parallel, once per object. Kernels of tangents are left out.
-    Kernels of adjoints are compiled only if ``adjoints`` is true. A single missing module is compiled at its launch."""
+    Kernels of adjoints are compiled only if ``adjoints`` is true. If only one module is missing, Warp compiles the
+    module at its first launch."""
     if _ahead.get(id(owner)) is owner:
         return
     _ahead[id(owner)] = owner
@@ -143,7 +144,7 @@ def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
 
 
 def _by_size(kernels: Sequence[wp.Kernel]) -> list[Any]:
-    """Return the modules of kernels, those that take longest to compile first."""
+    """Return the modules of the kernels, sorted by decreasing compile time."""
     sizes: dict[Any, int] = {}
     for kernel in kernels:
         source = kernel.adj.source
@@ -229,8 +230,8 @@ def complaint(error: Exception) -> str | None:
 
 
 def init_warp() -> str | None:
-    """Start Warp, and return the reason why it cannot store kernels, or None. Warp's messages are suppressed, and later
-    only warnings and errors are shown, unless the user chose a log level."""
+    """Start Warp, and return the reason why it cannot store kernels, or None. Unless the user chose a log level, the
+    messages of the start are hidden, and later only warnings and errors are shown."""
     chosen = wp.config.log_level
     quiet = os.environ.get(VERBOSE, "0") in ("", "0") and chosen >= wp.LOG_INFO
     try:

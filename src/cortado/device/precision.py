@@ -1,10 +1,10 @@
-"""The two floating-point precisions, with Warp functions for them, and types of parameters by name.
+"""The two floating-point precisions, Warp functions in either precision, and Warp types for parameters by their names.
 
-Lanes are GPU threads that share a particle. Each lane processes different neighbours, and the sums over the lanes are
-the same bits in every lane. The first lane writes the result. Lanes speed up simulations with few particles.
+Lanes are GPU threads that share a particle. Each lane processes different neighbours, and every lane gets the sums over
+all lanes with the same bits. The first lane writes the result. Lanes speed up simulations with few particles.
 
-A kernel for lanes is launched with LANES threads per particle and computes its particle as `wp.tid() // LANES`. On a
-CPU and for Warp's tape there is a single lane.
+A kernel for lanes is launched with LANES threads per particle. The index of a thread's particle is `wp.tid() // LANES`.
+On a CPU and for Warp's tape there is a single lane.
 """
 
 import inspect
@@ -35,7 +35,7 @@ class Precision:
     furthest: float
     """Greatest distance of positions from the origin [spacings]. Rounding is then at most about 0.001 spacings."""
     greatest: float
-    """Greatest size of a parameter. It keeps products of several parameters finite."""
+    """Greatest size of a parameter, which keeps products of several parameters finite."""
 
     @property
     def bytes(self) -> int:
@@ -89,7 +89,8 @@ class TypesByName:
     """
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
-        """Set the usual type, and tables that map types to names. Later tables have priority."""
+        """Set the usual type, and mappings from a type to the names of parameters with this type. Later mappings have
+        priority."""
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
@@ -159,7 +160,8 @@ def _of_the_gpu() -> SimpleNamespace:
 
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
-"""Pairs of the greatest number of particles and the number of lanes on a GPU."""
+"""Number of lanes on a GPU by the number of particles. A pair has the greatest number of particles, and the number of
+lanes."""
 _OF_MODULES: dict[str, int] = {}
 
 
@@ -174,8 +176,8 @@ def lanes_of(kernel: wp.Kernel) -> int:
 
 @cache
 def check_sum(kernel: wp.Kernel) -> None:
-    """Raise `TypeError` for a kernel with a neighbourhood that begins with the wrong particle, or that sums over lanes
-    but has only one thread per particle."""
+    """Raise `TypeError` for a kernel with a neighbourhood that begins with the wrong particle. The same error is raised
+    for a kernel that sums over lanes but has only one thread per particle."""
     source = kernel.adj.source
     if f"{kernel.adj.args[0].label}.first" not in source:
         raise TypeError(
@@ -212,7 +214,7 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """Return the number of lanes on a device. On a GPU this is ``wanted``, or by default a number that depends on the
+    """Return the number of lanes on a device. A GPU uses ``wanted`` lanes, or by default a number that depends on the
     number of particles."""
     if device.is_cpu:
         return 1

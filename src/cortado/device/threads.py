@@ -74,7 +74,8 @@ def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int)
 
 
 class WarpLock(ContextDecorator, threading.local):
-    """The lock that a thread holds while it uses Warp. It can be used as a context or a decorator, and is reentrant."""
+    """The lock that a thread holds while it uses Warp. The lock is reentrant, and works as a context manager or a
+    decorator."""
 
     _lock = threading.RLock()
     _entries = 0
@@ -309,7 +310,7 @@ _WEIGHING = 1600.0
 """Memory per wall particle during the computation of weights [bytes]."""
 _REALS_OF_PARTICLE, _REALS_OF_WALL, _REALS_OF_STEP, _REALS_OF_PIXEL = 90.0, 12.0, 8.0, 12.0
 _REALS_BACKWARD, _REALS_OF_ITERATION = 40.0, 8.0
-"""Stored numbers per particle, in the backward pass and in an iteration."""
+"""Stored numbers per particle: in the backward pass, and in each iteration of the solver."""
 _CGROUP = Path("/sys/fs/cgroup")
 _LIMITS = (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"))
 """Files with the memory limit and the used memory of a Linux control group [bytes], for versions 2 and 1."""
@@ -375,7 +376,7 @@ def within(budget: float, device: Any = None) -> int:
 
 
 def available(device: Any = None) -> float:
-    """Return the free memory of a Warp device or of this process [bytes]. It is infinite if it is unknown."""
+    """Return the free memory of a Warp device or of this process [bytes]. Memory of unknown size counts as infinite."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
     found = [float(psutil.virtual_memory().available)]

@@ -26,9 +26,9 @@ class TriangleTree:
     """Corners of the triangles (k, 3, 3) [m], sorted by the leaves of the tree."""
     order: Numbers
     starts: NDArray[np.int32]
-    """Index of the first triangle of each leaf (leaves + 1,). The last entry is the number of triangles."""
+    """Index of the first triangle of each leaf (leaves + 1,). The last element is the number of triangles."""
     boxes: Points
-    """Lower and upper corner of the box of each node (2 leaves, 6) [m]. Entry 0 is unused."""
+    """Lower and upper corner of the box of each node (2 leaves, 6) [m]. Index 0 is unused."""
 
     @classmethod
     def of(cls, corners: Points) -> "TriangleTree":
@@ -76,8 +76,9 @@ class TriangleTree:
         return found
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
-        """Return the index pairs (m, 2) of triangles that cross each other by more than ``tolerance`` [m]. Triangles do
-        not cross at a common vertex. ``names`` (k, 3) has equal entries at common vertices."""
+        """Return the index pairs (m, 2) of triangles that cross each other by more than ``tolerance`` [m]. Contact at a
+        common vertex is not a crossing. ``names`` (k, 3) has the same number wherever triangles have a common vertex.
+        """
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -244,7 +245,8 @@ LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
 BESIDE = 1e-12
 """Distance from a triangle at which its two sides are tested, relative to the size of the mesh."""
 SEEN = 1e-3
-"""Distance outside the surface at which other parts of the solid are sought [spacings of surface points]."""
+"""Height above the surface at which a point is tested for being inside another part of the solid [spacings of surface
+points]."""
 
 
 @dataclass(frozen=True, eq=False)

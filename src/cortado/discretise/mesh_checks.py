@@ -12,17 +12,18 @@ from cortado.errors import InputError
 SAME = 1e-6
 """Greatest distance between merged vertices, relative to the size of the mesh."""
 COARSE, TOLD = 0.02, 1e-3
-"""Rounding of coordinates above which a file is refused, and above which a note is given, relative to the size of the
-mesh."""
+"""Limits of the rounding of coordinates, relative to the size of the mesh. Above the first limit a file is refused.
+Above the second limit a note is given."""
 ASIDE = 1e-6
 """Distance from a surface at which its two sides are tested, relative to the size of the mesh."""
 CROSSED = 1e-7
-"""Least depth of crossing triangles, relative to the size of the mesh."""
+"""Depth of a crossing of two triangles above which the crossing counts, relative to the size of the mesh."""
 LOOKED_AT = 8192
 SAME_WAY = 1e-6
 """Greatest angle between coincident triangles at an edge [rad]."""
 TOGETHER = 1e-3
-"""Greatest angle between directions at an edge that count as one [rad], for float32 coordinates."""
+"""Angle below which two triangles at an edge count as running in the same direction [rad]. The angle allows for float32
+coordinates."""
 MEETING = (
     "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
     "says what is inside: delete faces that divide its inside or stick out of it."
@@ -101,14 +102,14 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
-    """Return the number of the connected component of each node (count,) in a graph with the edges ``links`` (m, 2)."""
+    """Return the index of each node's connected component (count,) in a graph with the edges ``links`` (m, 2)."""
     from trimesh.graph import connected_component_labels
 
     return np.asarray(connected_component_labels(links, count), dtype=np.int64)
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """Divide the triangles of a closed mesh into bodies, and return the number of each triangle's body (k,). Triangles
+    """Divide the triangles of a closed mesh into bodies, and return the index of each triangle's body (k,). Triangles
     at an edge belong to one body if the solid is between them.
 
     Raises `InputError` at an edge from which the surface continues in more than two directions. ``origin`` (3,) is the
@@ -164,15 +165,16 @@ def _pairs(angles: Points, ends: np.ndarray) -> Numbers:
 def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
-    """Sort triangles into parts without overlapping bodies. No parts are returned if the mesh does not cross itself.
-    Also return a triangle where a body crosses itself, or None, and a triangle of a body inside another body, or None.
+    """Divide the triangles into parts, so that no two bodies in the same part overlap. No parts are returned if the
+    mesh does not cross itself. Also return a triangle where a body crosses itself, or None. Finally, return a triangle
+    of a body that is inside another body, or None.
 
     Args:
-        mesh: closed.
+        mesh: a closed mesh.
         tree: the tree of the mesh's triangles.
         labels: (k,) the body of each triangle.
         crossings: (m, 2) pairs of triangles that cross.
-        some: (s,) triangles, including for each body at least one with an area.
+        some: (s,) indices of triangles. Each body has at least one triangle with a non-zero area among them.
         beside: (s, 3) a point just outside each triangle in ``some`` [m].
     """
     count = int(labels.max()) + 1
@@ -232,8 +234,8 @@ def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
 
 
 def _volume(corners: Points) -> float:
-    """Return the volume inside a closed surface of triangles (k, 3, 3) [m3]. It is negative if the normals point
-    inwards."""
+    """Return the volume inside a closed surface of triangles (k, 3, 3) [m3]. The volume is negative if the normals
+    point inwards."""
     a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
     return float((a * np.cross(b, c)).sum() / 6.0)
 

@@ -28,7 +28,7 @@ TOO_LARGE = 100.0
 PROBES, STEPS, HALVINGS = 20_000, 16, 12
 """Numbers in the measurement of thickness: surface points, steps for each point, and bisections of the last step."""
 BEYOND = 1e-3
-"""Distance behind a solid for tests of its back, relative to the length of a step."""
+"""Distance behind a wall at which the normal of its back is computed, relative to the length of a step."""
 
 
 def read_mesh(
@@ -120,7 +120,7 @@ def read_triangles(path: str) -> tuple[Points, Numbers, float]:
 
 
 def _scene(path: str) -> tuple[Any, bytes]:
-    """Read the scene of trimesh, and the first bytes of a file."""
+    """Read a file with trimesh. Return trimesh's scene, and the first bytes of the file."""
     import trimesh
 
     try:

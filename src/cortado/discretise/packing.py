@@ -1,8 +1,8 @@
 """Packing: particles are moved until the fluid has its rest density everywhere, in float64.
 
-Each round solves a nonlinear least-squares problem (Gauss-Newton). It moves the density of every particle towards the
-lattice's density and keeps close pairs apart. Walls count with their weights, and air counts as fluid. Colagrossi et
-al. (2012) and Negi and Ramachandran (2021) use repulsion instead.
+Each round solves a nonlinear least-squares problem (Gauss-Newton). A solution moves the density of every particle
+towards the lattice's density and keeps close pairs apart. In the density, walls count with their weights, and air
+counts as fluid. Colagrossi et al. (2012) and Negi and Ramachandran (2021) use repulsion instead.
 """
 
 from contextlib import nullcontext
@@ -34,9 +34,9 @@ class PointsAround:
     weights: Points
     """Weights of the points (m,), relative to a particle [-]."""
     air: tuple[int, int]
-    """First index of the points of air, and the index after the last. ``blind`` particles ignore air."""
+    """First index of the points of air, and the index after the last. Particles marked as ``blind`` ignore air."""
     lengths: Points
-    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
+    """Lengths of the periodic box (d,) [m], or 0 along axes without a period."""
     reach: float
     """Search radius [m]."""
 
@@ -118,7 +118,7 @@ class PointsAround:
 
 
 HIGHEST, AIM, LOWEST = 0.5 * SLACK, (-6e-3, -1e-3), -9e-3
-"""Greatest, desired and least relative density excess of a packed particle."""
+"""Greatest value, desired range and least value of the relative density excess of a packed particle."""
 ROUNDS = 6
 LISTED = 0.6
 NEAR = 0.9
@@ -132,8 +132,8 @@ DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return the relative density excess (n,), given the sums of kernels (n,) [1 / m^d]. It is at least 0 where
-    ``stays`` (n,) is true."""
+    """Return the relative density excess (n,), given the sums of kernels (n,) [1 / m^d]. Where ``stays`` (n,) is true,
+    the excess is at least 0."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
@@ -236,7 +236,7 @@ class Packing:
     air: int
     """Number of points of air."""
     lengths: Points
-    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
+    """Lengths of the periodic box (d,) [m], or 0 along axes without a period."""
 
     def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
         """Return rest positions (m, d) [m] of particles (n, d) [m], and the indices (m,) of the remaining particles.

@@ -34,7 +34,7 @@ class Around:
     behind_air: wp.int32
     is_periodic: wp.bool
     period: vector
-    """Lengths of the periodic box [m]. They are 0 along axes without a period."""
+    """Lengths of the periodic box [m], or 0 along axes without a period."""
     frequency: vector
     """Inverse lengths of the periodic box [1/m]."""
     per_support: real
@@ -61,7 +61,7 @@ class Equations:
     gradients: wp.array(dtype=vector)
     """Derivative of each pair's smoothing kernel with respect to the separation [1 / m^(d + 1)]."""
     own: wp.array(dtype=vector)
-    """Gradient of each particle's sum over fixed points [1 / m^(d + 1)]."""
+    """Gradient of each particle's sum of smoothing kernels over the fixed points [1 / m^(d + 1)]."""
     close_starts: wp.array(dtype=wp.int32)
     close_others: wp.array(dtype=wp.int32)
     """Second particle of each close pair."""
@@ -97,7 +97,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
         """List the points within ``reach`` of each particle, and sum their weighted smoothing kernels.
 
         At most ``most`` points are listed for each particle. Particles in ``blind`` ignore air. If ``are_own`` is true,
-        particle i is also point i, and only points with a higher index count.
+        particle i is also point i, and points with an index up to i are skipped.
         """
         i = first + wp.tid()
         x_i = x[i]

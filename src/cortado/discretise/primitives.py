@@ -127,8 +127,8 @@ class Revolved(Solid):
         x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
 
         def integral(p: int, q: int) -> float:
-            """Return the integral of x^p (y - height)^q over the profile, with radius x and height y, by Green's
-            theorem."""
+            """Return the integral of x^p (y - height)^q over the profile, by Green's theorem. Here x is the distance
+            from the axis, and y is the position along the axis."""
             return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
 
         volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[self.axis]
@@ -305,7 +305,7 @@ def outer_edges(profile: Faces) -> Points:
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """Return the start (2,) of an edge, or the edge's intersection with the axis."""
+    """Return the start (2,) of an edge. If the edge crosses the axis, return the intersection."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])

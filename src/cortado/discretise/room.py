@@ -27,8 +27,8 @@ class Region:
     base: Points
     """Point on the axis of the cylinder, or centre of the sphere (d,) [m]."""
     across: Points
-    """Mask of axes (d,): 1 for axes perpendicular to the cylinder's axis and for all axes of a sphere, and 0 for any
-    other axis."""
+    """Factor of each axis (d,) in the radius of a cylinder or sphere. The factor is 0 along the axis of a cylinder, and
+    1 along all other axes."""
     radius: float = np.inf
     """Radius of the cylinder or sphere [m]."""
     rim: float = np.inf
@@ -129,9 +129,9 @@ class Domain:
     """The periodic box of a scene. Positions may leave the box, and particles interact with all periodic images."""
 
     lower: tuple[float, ...]
-    """Lower corner of the periodic box (d,) [m]. It is 0 along axes without a period."""
+    """Lower corner of the periodic box (d,) [m], or 0 along axes without a period."""
     lengths: tuple[float, ...]
-    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
+    """Lengths of the periodic box (d,) [m], or 0 along axes without a period."""
 
     @classmethod
     def of(cls, lower: Points, lengths: Points) -> Self:
@@ -171,11 +171,11 @@ class Domain:
         return start, np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
-        """Return the vectors from a place (d,) to all images of points (n, d) within ``reach`` [m], after applying
-        ``seen``. The list has one array (n, k) per image.
+        """Return the vectors from ``place`` (d,) to the images of points (n, d) [m], after applying ``seen``. The list
+        has one array (n, k) for each image within ``reach`` [m].
 
-        ``seen`` is a linear function of vectors (n, d), such as their component across a direction. Images with equal
-        results count once.
+        ``seen`` is a linear function of vectors (n, d), such as their component across a direction. Images that
+        ``seen`` maps to the same vector count once.
         """
         steps, inverse, shifts = self.images(reach, seen)
         way = seen(self.wrapped(points) - place)
@@ -184,8 +184,9 @@ class Domain:
         return [way + shift for shift in shifts] if len(steps) else [way]
 
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
-        """Return the translations between distinct images (m, k) [m], their inverse (k, m), and the shifts to all
-        images within ``reach`` (i, k) [m]. Images are distinct if ``seen`` maps them to different points."""
+        """Return the translations between distinct images (m, k) [m], and the inverse matrix of the translations (k,
+        m). Also return the shifts to all images within ``reach`` (i, k) [m]. Images are distinct if ``seen`` maps them
+        to different points."""
         lengths, found = np.array(self.lengths), []
         axes = seen(np.eye(len(lengths))) if lengths.any() else np.zeros((0, 0))
         left = np.where(lengths[: len(axes), None] > 0.0, axes, 0.0)
@@ -216,7 +217,7 @@ class Room:
     region: Region
     solids: Sequence[Solid]
     periods: Points
-    """Lengths of the periodic box (d,) [m]. They are 0 along axes without a period."""
+    """Lengths of the periodic box (d,) [m], or 0 along axes without a period."""
 
     @property
     def dimension(self) -> int:

@@ -24,7 +24,7 @@ NEARBY = 4
 EXCESS = 0.003
 """Greatest relative difference between the volume of a stretched lattice and the volume of its shape."""
 MOST_STRETCHED = 0.03
-"""Greatest logarithm of the stretching along an axis. It limits the error of the density to 1 %."""
+"""Greatest logarithm of the stretching along an axis, which limits the error of the density to 1 %."""
 
 
 class Rows:
@@ -123,7 +123,7 @@ def lattice(counts: Points, spacing: float) -> Points:
 
 
 def disc(radius: float, spacing: float, dimension: int) -> Points:
-    """Return a lattice in a disc or on a line segment about the origin (n, dimension) [m]. It has at least one
+    """Return a lattice in a disc or on a line segment about the origin (n, dimension) [m]. The lattice has at least one
     point."""
     points = lattice(np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0)), spacing)
     return points[np.linalg.norm(points, axis=1) <= radius]
@@ -141,8 +141,8 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """Return an origin (d,) [m] near points (n, d) [m] that are far from 0, or 0. The origin is a multiple of a power
-    of two, so that subtracting it causes no rounding."""
+    """Return an origin (d,) [m] near the points (n, d) [m], or 0 if the points are not far from 0. The origin is a
+    multiple of a power of two, so that subtracting it causes no rounding."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
@@ -219,8 +219,8 @@ def wrapped(positions: Points, lengths: Points) -> Points:
 
 
 MOST_AVERAGE_COMPRESSION = 0.1
-"""Greatest mean compression of the initial particles. The compression is the excess of the relative number density over
-1, or 0."""
+"""Greatest mean compression of the initial particles. The compression is the relative number density minus 1, but at
+least 0."""
 MOST_DENSITY = 1.5
 """Largest relative number density of an initial particle."""
 NOTED_COMPRESSION = 0.03
@@ -244,7 +244,7 @@ def check_crowding(
     burst apart. If two bodies of fluid overlap, the message names both.
 
     Args:
-        what: the particles in words, in the plural.
+        what: name of the particles for messages, in the plural.
         positions: (n, d) [m].
         kernel: smoothing kernel.
         support: support radius [m].
@@ -344,7 +344,7 @@ def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments:
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """Return a Warp array that shares the memory of a NumPy array. If there are several axes, the last one becomes
+    """Return a Warp array that shares the memory of a NumPy array. The last of several axes becomes the components of
     vectors."""
     import warp as wp
 

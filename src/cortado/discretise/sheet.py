@@ -99,8 +99,8 @@ class Sheet(Solid):
 
     @cached_property
     def _across(self) -> Points:
-        """Return the normals of the edges or triangles (k, d), proportional in length to the size of the edge or
-        triangle."""
+        """Return the normals of the edges or triangles (k, d). The length of a normal is proportional to the size of
+        the edge or triangle."""
         first, *others = np.moveaxis(self.pieces, 1, 0)
         along = [other - first for other in others]
         return along[0][:, ::-1] * np.array([-1.0, 1.0]) if len(along) == 1 else np.cross(*along)
@@ -155,7 +155,7 @@ class Thickened(Solid):
 
 
 def sheet_points(sheet: Sheet, lattice: RestLattice) -> WallPoints:
-    """Build the wall particles of a sheet, on both sides and around its ends. Their depths are the depths of a flat
+    """Build the wall particles of a sheet, on both sides and around its ends. The particles have the depths of a flat
     wall's layers."""
     apart, layers = DENSITY * lattice.spacing, lattice.layers
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
@@ -168,11 +168,11 @@ def sheet_points(sheet: Sheet, lattice: RestLattice) -> WallPoints:
 def sheet_weights(
     sheet: Sheet, points: Sequence[Points], flat: Sequence[Points], room: Room, lattice: RestLattice, least: float
 ) -> Points:
-    """Compute the weights of a sheet's wall particles (b,). They are fitted at points at least ``least`` [m] from any
-    surface.
+    """Compute the weights of a sheet's wall particles (b,). The weights are fitted at points that are at least
+    ``least`` [m] from any surface.
 
     ``points`` and ``flat`` list the positions (b, d) [m] and the flat-wall weights (b,) of wall particles. The first
-    entry belongs to the sheet, and the remaining entries belong to further walls in the room.
+    array of a list belongs to the sheet, and the remaining arrays belong to further walls in the room.
     """
     spacing, own = lattice.spacing, len(points[0])
     heights = spacing * (np.arange(int(np.ceil(lattice.support / spacing - 0.5))) + 0.5)

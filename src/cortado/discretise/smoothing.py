@@ -85,7 +85,7 @@ SLACK = 1e-4
 """Relative amount by which the density of the rest lattice is below the rest density. At the rest density the
 derivative of the pressure would depend on round-off."""
 RATE_LIMIT = 1.5
-"""Bound on `greatest_rate`. Pressure iterations converge below 2."""
+"""Greatest allowed value of `greatest_rate`. Pressure iterations converge if the rate is below 2."""
 
 
 def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
@@ -97,8 +97,7 @@ def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarra
 
 
 def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
-    """Return the wave vectors of the lattice (count^d, d) [rad/m], with components from 0 to the shortest
-    wavelength."""
+    """Return the wave vectors of the lattice (count^d, d) [rad/m], from 0 to the wave vector of the shortest wave."""
     return np.array(list(itertools.product(np.linspace(0.0, np.pi / spacing, count), repeat=dimension)))
 
 
@@ -147,8 +146,8 @@ def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: floa
 
 
 def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the sum of the smoothing kernel's squared gradient over the lattice [1 / m^(2 d + 2)]. It scales the
-    relaxation beside walls."""
+    """Return the sum of the smoothing kernel's squared gradient over the lattice [1 / m^(2 d + 2)]. The sum scales the
+    relaxation of the pressure beside walls."""
     return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 
@@ -190,7 +189,8 @@ def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 @cache
 def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the damping coefficient of `cortado.sph.stress_kernels` on the lattice [-]."""
+    """Return the damping coefficient ``control`` of the viscous stress in `cortado.sph.stress_kernels` on the lattice
+    [-]."""
     return 4.0 / (3.0 * circulation_factor(kernel, spacing, support, dimension))
 
 

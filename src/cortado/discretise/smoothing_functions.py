@@ -115,8 +115,8 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
 
     @wp.func
     def square(x: vector, per_h: real) -> real:
-        """Return the squared distance relative to the support radius. A tiny number is added, which keeps its
-        reciprocal finite."""
+        """Return the squared distance relative to the support radius. A tiny number is added, so that the result has a
+        finite reciprocal."""
         return wp.dot(x, x) * (per_h * per_h) + tiny
 
     @wp.func

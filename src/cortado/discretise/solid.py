@@ -164,7 +164,7 @@ class Placed(Solid):
 
 @dataclass(frozen=True)
 class Hollow(Solid):
-    """All of space except a shape, as a tank with infinitely thick walls."""
+    """All of space except a shape, like a tank with infinitely thick walls."""
 
     cavity: Solid
 
@@ -197,7 +197,8 @@ class Mass:
     volume: float
     """Volume [m^d]."""
     inertia: Points
-    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only the entry about z is not 0."""
+    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only the component about z is
+    not 0."""
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":

@@ -20,11 +20,12 @@ Near = Callable[[Points, float], Which]
 FINE = {2: 12, 3: 3}
 """Number of candidate points on a surface per spacing, by dimension."""
 CELLS = (3, 4)
-"""Numbers of parts along each axis of a cell near a surface. The last number must be even."""
+"""Number of subdivisions of a cell along each axis, in two successive refinements near a surface. The last number must
+be even."""
 APART, LEAST_APART = 0.78, 0.65
 """Least distance between chosen points, and least distance after the points are moved [spacings]."""
 FIRST, GROWTH = 0.05, 1.7
-"""Fraction of the points in the first portion, and growth factor of later portions."""
+"""Fraction of the candidate points that is tested first, and growth factor of later portions of candidates."""
 ROUNDS = {2: 40, 3: 4}
 """Number of rounds of Lloyd's algorithm, by dimension."""
 OFF_FACES = (0.31, 0.17, 0.23)
@@ -194,7 +195,8 @@ class WallPoints(Rows):
 
 @dataclass(frozen=True, eq=False)
 class ContainerWalls:
-    """The wall particles of a container without solids. Wall particles far from all solids keep their positions."""
+    """The wall particles of a container before solids are added to it. Wall particles far from all solids keep their
+    positions."""
 
     points: WallPoints
     solids: Sequence[Solid]
@@ -236,7 +238,7 @@ class ContainerWalls:
 DENSITY = 0.75
 """Distance between wall particles [spacings]."""
 MARGIN = 0.01
-"""Greatest distance of touching surfaces [spacings]."""
+"""Greatest distance between two surfaces that count as touching [spacings]."""
 TOLERANCE = 0.05
 """Tolerance in comparisons of depths below two surfaces [spacings]."""
 EDGE = 0.4
@@ -246,7 +248,8 @@ EXPOSED_HALVINGS, EXPOSED_ROUNDS, DIGITS = 12, 30, 4
 
 @dataclass(frozen=True)
 class ExposedSurface:
-    """Fine points on the surface that fluid can touch: the surface of solids, and of the container near solids."""
+    """Closely spaced points on the surface that fluid can touch. The surface consists of the surfaces of solids, and of
+    the container's surface near solids."""
 
     feet: Points
     """Points on the surface (n, d) [m]."""
@@ -262,8 +265,8 @@ class ExposedSurface:
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """Find fine points on the surface that fluid can touch. Along periodic axes the surface extends one support
-        radius beyond the periodic box. ``lower`` (d,) [m] is the lower corner of the periodic box."""
+        """Find closely spaced points on the surface that fluid can touch. Along periodic axes the surface extends one
+        support radius beyond the periodic box. ``lower`` (d,) [m] is the lower corner of the periodic box."""
         fine = container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
@@ -303,7 +306,7 @@ class ExposedSurface:
 
     def beneath(self, depth: float) -> SurfacePoints:
         """Return points about a spacing apart, ``depth`` [m] below the surface or in the middle of thinner parts.
-        Points near the container's kept wall particles are left out."""
+        Points are left out near wall particles of the container that keep their positions."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
         ends = np.zeros(len(thin)), np.full(len(thin), depth)
         low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
@@ -378,15 +381,15 @@ class ExposedSurface:
 
 
 def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
-    """Test (n,) which points (n, d) [m] are inside the periodic box or at most ``reach`` [m] outside it. ``lower`` is
-    its lower corner."""
+    """Test (n,) which points (n, d) [m] are inside the periodic box or at most ``reach`` [m] outside. ``lower`` (d,)
+    [m] is the lower corner of the box."""
     within = (points >= lower - reach) & (points < lower + periods + reach)
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
 def _is_exposed(feet: Points, away: Points, container: ContainerWalls) -> Which:
-    """Test (n,) which surface points (n, d) [m] fluid can touch. ``away`` (n, d) has the outward unit vectors of the
-    solids."""
+    """Test (n,) at which surface points (n, d) [m] fluid can touch the surface. ``away`` (n, d) has the outward unit
+    vectors of the solids."""
     spacing = container.spacing
     return container.room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 

@@ -1,11 +1,11 @@
 """Queries on surfaces, in float64: the nearest point on triangles, winding numbers, and crossings of line segments with
 sheets.
 
-The children of node n are the nodes 2 n and 2 n + 1. Nodes with numbers from ``leaves`` on are leaves. The first leaf
-contains the triangles from ``starts[0]`` up to ``starts[1]``.
+The triangles are stored in a binary tree. The children of node n are the nodes 2 n and 2 n + 1. A node is a leaf if its
+number is at least ``leaves``. The first leaf contains the triangles ``starts[0]`` to ``starts[1] - 1``.
 
 A sheet is an open surface of faces, which are edges in 2-D and triangles in 3-D. Faces extend slightly beyond their
-edges, so that no line segment passes between two faces.
+boundaries, so that no line segment passes between two faces.
 """
 
 from collections.abc import Sequence
@@ -70,8 +70,8 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
-    """Find the nearest points on the triangles and the squared distances. If no triangle is within ``reach``, the
-    result is the given point."""
+    """For each point, find the nearest point on the triangles and the squared distance. If no triangle is within the
+    distance ``reach``, the given point itself is stored."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach
@@ -117,8 +117,8 @@ def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach:
 
 @wp.func
 def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
-    """Return 1 if a rising edge is ahead of a point along the first axis, -1 for a falling edge, and 0 for no edge. The
-    result is consistent between the two triangles at an edge."""
+    """Return 1 if a ray from a point along the first axis crosses an upward edge, and -1 for a downward edge. Return 0
+    if the ray misses the edge. The two triangles that share an edge get consistent results."""
     upwards = int(1)
     low = a
     high = b
@@ -135,8 +135,8 @@ def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
 
 @wp.func
 def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
-    """Return 1 if a ray along the last axis leaves the solid through a triangle, -1 if the ray enters, and 0 if it
-    misses."""
+    """Return 1 if a ray along the last axis leaves the solid through a triangle. Return -1 if the ray enters the solid,
+    and 0 if the ray misses the triangle."""
     around = side_of_edge(p, a, b) + side_of_edge(p, b, c) + side_of_edge(p, c, a)
     if around == 0 or p[2] > wp.max(a[2], wp.max(b[2], c[2])):
         return int(0)
@@ -150,7 +150,8 @@ def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_windings(first: int, points, boxes, starts, corners, leaves: int, windings):
-    """Compute the winding numbers of closed surfaces around points. Inside a surface with outward normals it is 1."""
+    """Compute the winding numbers of closed surfaces around points. The winding number is 1 inside a surface with
+    outward normals."""
     i = first + wp.tid()
     p = points[i]
     total = int(0)
@@ -174,8 +175,8 @@ def find_windings(first: int, points, boxes, starts, corners, leaves: int, windi
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """Test whether a line segment passes through the interior of a triangle. Both ends must be further than
-    ``tolerance`` from the triangle's plane."""
+    """Test whether a line segment passes through the interior of a triangle. The ends of the segment must be further
+    than ``tolerance`` from the triangle's plane."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -201,8 +202,8 @@ def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
 def some_edge_pierces(
     corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
 ) -> wp.bool:
-    """Test whether an edge of triangle s passes through triangle t. Edges that share a vertex with triangle t do not
-    count."""
+    """Test whether an edge of triangle s passes through triangle t. Edges that share a vertex with triangle t are
+    ignored."""
     found = wp.bool(False)
     for k in range(3):
         following = (k + 1) % 3
@@ -218,8 +219,9 @@ def some_edge_pierces(
 def find_crossings(
     first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
-    """Find the triangles with a higher number that cross each triangle. Their numbers are written to ``others``,
-    beginning at the index in ``places``, while there is room."""
+    """For each triangle, find the triangles that cross it and have a higher number. For triangle i, the numbers found
+    are written to ``others``, from index ``places[i]`` up to ``places[i + 1]``. Crossings beyond this range are only
+    counted in ``counts``."""
     i = first + wp.tid()
     low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
     high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))
@@ -251,9 +253,10 @@ def find_crossings(
 
 
 MARGIN = {"float64": 1e-6, "float32": 1e-3}
-"""Widening of faces [spacings], which exceeds round-off up to 1,000 spacings from the origin."""
+"""Distance by which faces extend beyond their boundaries [spacings]. The distance exceeds round-off up to 1,000
+spacings from the origin."""
 AROUND = 1e-3
-"""Margin of the search for faces around a line segment, in float32 [spacings]."""
+"""Margin around a line segment in the search for nearby faces, which uses float32 [spacings]."""
 
 
 @cache
@@ -266,12 +269,12 @@ def faces_type(precision: Precision) -> Any:
         starts: wp.array(dtype=wp.int32)
         """Index of the first face of each sheet."""
         middles: wp.array(dtype=vector)
-        """Centre of each sheet [m], which is the origin of its faces."""
+        """Centre of each sheet [m]. Positions of the sheet's faces are relative to this centre."""
         normals: wp.array(dtype=vector)
         places: wp.array2d(dtype=vector)
-        """A point on each boundary of a face (faces, 3) [m]."""
+        """A point on each boundary of each face (faces, 3) [m]."""
         inwards: wp.array2d(dtype=vector)
-        """Unit vectors from each boundary into the face (faces, 3). In 2-D the third vector is 0."""
+        """Unit vectors from each boundary of a face into the face (faces, 3). In 2-D the third vector is 0."""
         margin: real
         around: real
 
@@ -320,8 +323,8 @@ def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 
 def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision: Precision, device: Any) -> Any:
-    """Return the struct of the faces of sheets, from their corners (k, d, d) [m] and unit normals (k, d). Also return
-    the search trees of the struct, which the caller must keep alive."""
+    """Build the Warp struct of the faces of all sheets. Each sheet has face corners (k, d, d) [m] and unit normals (k,
+    d). Also return the search trees of the struct, which the caller must keep alive."""
     made, trees, middles, rows = faces_type(precision)(), [], [], []
     for corners, normals in sheets:
         middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))

@@ -1,4 +1,5 @@
-"""The layers of wall particles of boxes and cups, and the weights of wall particles in the density, in float64."""
+"""Place layers of wall particles around boxes and cups, and compute the weights of wall particles in the density. All
+computations use float64."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def nearest_cells(length: float, spacing: float) -> int:
-    """Return the number of cells that best fills a length [m], at least 1."""
+    """Return the number of cells of size ``spacing`` that fits a length [m] best, at least 1."""
     return max(int(np.floor(length / spacing + 0.5)), 1)
 
 
@@ -39,8 +40,8 @@ def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: fl
     """Return one layer of wall particles (n, 3) around an upright cup. The centre of the cup's base is at the origin,
     and its height is along the third axis.
 
-    The side consists of rings, ``depth`` [m] outside and about a spacing apart. The base and the lid continue the
-    lattice of the fluid, with an additional ring at the side.
+    The side wall consists of rings about a spacing apart, at the distance ``depth`` [m] outside the cup. The base and
+    the lid continue the lattice of the fluid, with an additional ring at the side wall.
     """
     side = ring(radius + depth, spacing)
     end = np.concatenate([disc(radius, spacing, 2), side])
@@ -65,17 +66,17 @@ def stacked(flat: Points, levels: Points) -> Points:
 
 
 OVERLAP = 0.8
-"""Greatest distance of upright lattices from the side of a cup, relative to ``reach``."""
+"""Least distance of axis-parallel lattices from the side of a cup, relative to ``reach``."""
 
 
 @dataclass(frozen=True)
 class Places(Rows):
-    """Points beside walls where fluid may rest, with the axes of each point's lattice."""
+    """Points beside walls where fluid may rest. Each point has the axes of its local particle lattice."""
 
     points: Points
-    """Points (n, d) [m]."""
+    """Positions of the points (n, d) [m]."""
     axes: Points
-    """Axes of the lattices (n, d, d), as unit vectors."""
+    """Unit vectors along the axes of each point's lattice (n, d, d)."""
 
     @classmethod
     def upright(cls, points: Points) -> "Places":
@@ -84,8 +85,8 @@ class Places(Rows):
 
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
-    """Return the places less than ``reach`` [m] from a wall of a box. The first places are half a spacing from the
-    wall."""
+    """Return points less than ``reach`` [m] from a wall of a box, where fluid may rest. The points nearest to a wall
+    are half a spacing from the wall."""
     every = [_between(a, b, open_axis, spacing) for a, b, open_axis in zip(lower, upper, periodic, strict=True)]
     beside = [
         np.zeros(len(x), dtype=bool) if open_axis else np.minimum(x - a, b - x) < reach
@@ -97,11 +98,11 @@ def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: 
 
 
 def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: float) -> Places:
-    """Return the places less than ``reach`` [m] from a wall of an upright cup. The centre of the cup's base is at the
-    origin, and its height is along the third axis.
+    """Return points less than ``reach`` [m] from a wall of an upright cup, where fluid may rest. The centre of the
+    cup's base is at the origin, and its height is along the third axis.
 
-    Near the side of the cup, lattices are aligned with the side. On the base and the lid, they are lattices of the
-    fluid in the cup. The top of an open cup has no places.
+    Lattices near the side of the cup are aligned with the side. Points at the base and at the lid lie on the lattice of
+    the fluid in the cup. The top of an open cup has no points.
     """
     levels = _between(0.0, height, False, spacing)
     closed = levels if lid else levels[levels < height - reach]
@@ -117,8 +118,8 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
 
 
 def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
-    """Return coordinates along an axis, a spacing apart from each wall inwards. Along a periodic axis the coordinates
-    are evenly spaced."""
+    """Return lattice coordinates between two walls, starting half a spacing from each wall. Along a periodic axis the
+    coordinates are evenly spaced."""
     count = nearest_cells(upper - lower, spacing)
     cells = np.arange(count, dtype=np.float64) + 0.5
     if periodic:
@@ -127,7 +128,7 @@ def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Poin
 
 
 ENDS = 6.0
-"""Distance from an edge above which the weights of wall particles are constant [support radii]."""
+"""Distance from an edge of a box [support radii]. At greater distances the weights of wall particles are constant."""
 WHOLE = 1e-9
 
 
@@ -135,7 +136,7 @@ def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
     """Shorten a box between corners (d,) [m], by removing cells from the middle of its long sides. The weights of wall
-    particles do not change, because they repeat far from edges.
+    particles do not change, because they are constant far from edges.
 
     Return the upper corner of the short box (d,) [m], and a function that maps points on the walls (n, d) [m] to the
     short box.
@@ -156,7 +157,8 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer of wall particles [spacings]. It exists if the second layer of fluid reaches the wall."""
+"""Depth of the shallow layer of wall particles [spacings]. The layer exists only if the smoothing kernel of the second
+fluid layer reaches the wall."""
 
 
 @dataclass(frozen=True)
@@ -164,9 +166,9 @@ class WallLayers:
     """Layers of wall particles behind a flat wall, from the shallowest to the deepest."""
 
     depths: tuple[float, ...]
-    """Distances of the layers behind the surface [m]."""
+    """Distance of each layer behind the wall's surface [m]."""
     weights: tuple[float, ...]
-    """Weight in the density of a wall particle in each layer, relative to a fluid particle."""
+    """Density weight of a wall particle in each layer, relative to the weight of a fluid particle."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ class RestLattice:
 
     @cached_property
     def offsets(self) -> Points:
-        """Return the separations of a lattice point from the lattice points within the support radius (m, d) [m]."""
+        """Return the vectors from a lattice point to all lattice points within the support radius (m, d) [m]."""
         return lattice_offsets(self.spacing, self.support, self.dimension)
 
     def weights(self, separations: Points) -> Points:
@@ -188,8 +190,8 @@ class RestLattice:
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """Return the smoothing kernel and its gradient times the spacing (m, 1 + d) [-], relative to the kernel's sum
-        over the lattice."""
+        """Return the smoothing kernel, and its gradient times the spacing, at separations (m, 1 + d) [-]. The results
+        are divided by the kernel's sum over the lattice."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
@@ -211,8 +213,8 @@ class RestLattice:
         - A uniform pressure pushes no particle of the first layer. The wall's density contribution is steep enough to
           balance the pressures of the particle and its neighbours.
 
-        One layer is enough if the second layer of fluid does not reach the wall, as with support radii of up to two
-        spacings.
+        Support radii of up to two spacings need only one wall layer, because the kernel of the second fluid layer does
+        not reach the wall.
         """
         from scipy.optimize import brentq
 
@@ -244,24 +246,25 @@ class RestLattice:
 
 
 STIFFNESS = 3e-3
-"""Penalty on relative deviations from a flat wall's weights, relative to density errors."""
+"""Least-squares penalty on relative deviations from the weights of a flat wall. The penalty on density errors is 1."""
 UNEVEN_STIFFNESS = 0.06
-"""Penalty like `STIFFNESS`, for particles that are not on a lattice. A smaller penalty would let fluid leak."""
+"""Penalty like `STIFFNESS`, for wall particles that are not on a lattice. A smaller penalty would let fluid leak."""
 LEAST, ROUNDS = 0.6, 4
-"""Least weight of particles that are not on a lattice, relative to a flat wall, and number of rounds to impose it."""
+"""Least weight of wall particles that are not on a lattice, relative to a flat wall. ``ROUNDS`` is the number of
+iterations that impose this bound."""
 BALANCE = 0.02
-"""Weight of the force from a uniform pressure, relative to density errors. Smaller weights let fluid leak, and larger
-weights make corners too dense."""
+"""Least-squares weight of the force from a uniform pressure, relative to density errors. Smaller weights let fluid
+leak, and larger weights make corners too dense."""
 RAISED = 3.0
-"""Height above a solid where free room is measured [spacings]."""
+"""Distance from a solid at which the free space around a point is measured [spacings]."""
 CHUNK = 4096
 Crossed = Callable[[Points, Points], Which]
 """A function that tests which line segments between two arrays of points (n, d) [m] cross a sheet."""
 
 
 def _missing(lattice: RestLattice, places: Places, room: Room, crossed: Crossed | None) -> Points:
-    """Return the sums at each place over lattice points outside the room or behind a sheet (n, 1 + d), as in
-    `RestLattice.sums`. Points near the boundary are weighted with the outside fraction of their cell."""
+    """Sum the kernel and its gradient over lattice points outside the room or behind a sheet (n, 1 + d), as in
+    `RestLattice.sums`. A lattice point near the boundary is weighted with the outside fraction of its cell."""
     offsets = lattice.offsets
     cells = places.points[:, None] + offsets @ places.axes
     raised = places.points + RAISED * lattice.spacing * places.axes[:, 0]
@@ -296,14 +299,16 @@ def wall_weights(
 
     Args:
         walls: (b, d) wall particles [m].
-        flat: (b,) their weights in a flat wall [-], or known weights.
+        flat: (b,) weights of the wall particles in a flat wall [-]. The last ``known`` weights are final.
         places: places where fluid may rest.
         lattice: the lattice of the fluid at rest.
-        room: the room for fluid.
+        room: the region that fluid can fill.
         lower: (d,) lower corner of the periodic box [m].
-        are_even: True for wall particles on lattices, with weights of at least 0. False for minimum weights of `LEAST`.
+        are_even: True if the wall particles are on lattices. The weights are then at least 0, and otherwise at least
+            `LEAST` times the weights in a flat wall.
         known: number of wall particles with known weights, which come last.
-        crossed: the test for crossing a sheet. Fluid interacts with the sheet's wall particles only through the sheet.
+        crossed: test for line segments that cross a sheet, given if the wall particles belong to a sheet. Fluid
+            interacts with these particles only across the sheet.
     """
     from scipy.sparse import coo_array, vstack
 
@@ -313,8 +318,8 @@ def wall_weights(
     is_sheet[:sought] = crossed is not None
 
     def demands(places: Places) -> tuple["csr_array", Points]:
-        """Return the matrix (m, b) of sums over wall particles at places, and the sums (m,) that fluid at rest needs.
-        The matrix multiplies weights relative to flat walls."""
+        """Return the matrix (m, b) and the right-hand side (m,) of the least-squares fit. The unknowns are the weights
+        relative to flat walls."""
         place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
         if crossed is not None:
             seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
@@ -338,8 +343,8 @@ def wall_weights(
 
 
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Return the relative changes (b,) of flat-wall weights for wall particles on lattices. The product of the matrix
-    ``sums`` (m, b) and the changes is ``wanted`` (m,). Weights are at least 0."""
+    """Fit the relative changes (b,) of flat-wall weights, for wall particles on lattices. The least-squares equations
+    are ``sums @ changes = wanted``. The new weights are at least 0."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 
@@ -350,8 +355,8 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Return the relative changes (b,) of flat-wall weights for wall particles that are not on a lattice, like
-    `even_changes`. Weights are at least `LEAST`."""
+    """Fit the relative changes (b,) of flat-wall weights as in `even_changes`, for wall particles that are not on a
+    lattice. The new weights are at least `LEAST` times the flat-wall weights."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)

@@ -16,7 +16,8 @@ __all__ = ["EnvState", "FluidEnv", "FluidVectorEnv", "Task", "Twin", "make_vec"]
 
 
 def make_vec(task: str | Task, num_envs: int = 1, **settings: Any) -> FluidVectorEnv:
-    """Make ``num_envs`` environments of a task, such as "Carry", together, with ``settings`` of `FluidVectorEnv`."""
+    """Make a batch of ``num_envs`` environments of a task, such as "Carry". ``settings`` are further arguments of
+    `FluidVectorEnv`."""
     return FluidVectorEnv(task, num_envs, **settings)
 
 

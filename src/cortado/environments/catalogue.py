@@ -25,7 +25,8 @@ def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[s
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return the actuators of a solid that moves along x, at most ``fastest`` [m/s], and turns about z [rad/s]."""
+    """Return two actuators of a solid: one for its motion along x and one for its rotation about z. The greatest
+    velocities are ``fastest`` [m/s] and ``turning`` [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
     moved = Velocity(f"{solid}.displacement", still, (0,), (fastest,))
@@ -33,7 +34,8 @@ def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Act
 
 
 class Vessels(Task):
-    """A base class of tasks with cups and jugs, which are cross-sections in 2-D, and round about z = 0 in 3-D."""
+    """A base class of tasks with cups and jugs. In 2-D a vessel is a cross-section. In 3-D a vessel is round, with its
+    axis at z = 0."""
 
     view: ClassVar[dict[str, Any]] = {}
 
@@ -41,19 +43,22 @@ class Vessels(Task):
         return [x, y, 0.0][: self.dimension]
 
     def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Return the corners of a box with a cross-section [m]. In 3-D the box has a square base about z = 0."""
+        """Return the corners of a box, given the corners of its cross-section [m]. In 3-D the box has a square base
+        about z = 0."""
         half = 0.5 * (upper[0] - lower[0])
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the table of a fluid with a cross-section [m]: a box in 2-D, and a cylinder in 3-D."""
+        """Return the scene table of a fluid, given the corners of its cross-section [m]. The fluid fills a box in 2-D
+        and a cylinder in 3-D."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
         return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
 
     def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
-        """Return the scene table of a container in 2-D. In 3-D there is none, and spilt fluid falls without end."""
+        """Return the scene table of a container in 2-D. In 3-D there is no container, and spilt fluid falls without
+        end."""
         return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
 
 
@@ -75,7 +80,7 @@ class Carry(Vessels):
     """Inner width of the cup, depth of the water, inner height of the cup, and thickness of the walls [m]."""
     floor = -0.15
     fastest, turning = 0.6, 1.0
-    """Greatest velocity [m/s] and angular velocity [rad/s]."""
+    """Greatest velocity [m/s] and greatest angular velocity [rad/s] of the cup."""
     actuators = led("cup", fastest, turning, 2)
     goals = np.array([0.5 * width + 0.3]), np.array([0.5 * width + 0.5])
 
@@ -103,7 +108,8 @@ class Carry(Vessels):
 class CarryInSpace(Carry):
     """The task of carrying a round cup of water along a line to a place without spilling.
 
-    Actions, goal and reward are the same as for `Carry`. The cup is lower, and leans about an axis across its path.
+    Actions, goal and reward are the same as for `Carry`. The cup is lower, and leans about an axis perpendicular to its
+    path.
     """
 
     name = "CarryInSpace"
@@ -114,10 +120,12 @@ class CarryInSpace(Carry):
 
 
 class Latte(Task):
-    """The task of pouring milk from a moving nozzle into coffee. The milk should land as from a hidden path.
+    """The task of pouring milk from a moving nozzle into coffee. The milk should land as if the nozzle had followed a
+    hidden path.
 
-    The actions are target positions of the nozzle along x. The reward is minus the mean squared distance of the poured
-    milk from its positions in a run with the hidden path, divided by the squared radius of the cup.
+    The actions are target positions of the nozzle along x. The targets of milk particles are their positions in a run
+    along the hidden path. The reward is minus the mean squared distance of the poured milk from its targets, divided by
+    the squared radius of the cup.
 
     The task follows LatteArt of FluidLab (Xian et al. 2023). Its reward differs by a factor and a constant.
     """
@@ -153,14 +161,16 @@ class Latte(Task):
 
 
 def hidden_actions(task: Latte) -> NDArray:
-    """Return the actions of the hidden path (horizon, 1). The path goes once around a heart and then to its middle."""
+    """Return the actions of the hidden path (horizon, 1). The path goes once around a heart shape, and then to the
+    middle of the heart."""
     angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
     return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
 
 
 @cache
 def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
-    """Return the positions on the hidden path (horizon, n, d) [m], and the weights of the milk (horizon, n) [1/m2]."""
+    """Return the particle positions (horizon, n, d) [m] in a run along the hidden path. Also return the weights of milk
+    particles in the reward (horizon, n) [1/m2]."""
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
@@ -190,7 +200,7 @@ class Pour(Vessels):
     lower, upper, wall = (0.25, -0.28), (0.45, -0.12), 0.05
     """Lower and upper corner of the inside of the glass, and thickness of the walls [m]."""
     fastest, turning = 0.1, 4.0
-    """Greatest velocity [m/s] and angular velocity [rad/s]."""
+    """Greatest velocity [m/s] and greatest angular velocity [rad/s] of the jug."""
     actuators = led("jug", fastest, turning, 2)
 
     @property
@@ -276,8 +286,8 @@ class Splash(Task):
     """The task of shaking a box of water after a dam break, so that the water takes the shape of the letter L.
 
     The actions are the acceleration of the box along x and y, which acts on the water as a change of gravity. The goal
-    is the left side of the letter's vertical bar. The reward is the fraction of the water inside the letter, as a
-    smooth function of particle positions (`cortado.environments.terms.Share`).
+    is the x coordinate of the left side of the letter's vertical bar. The reward is the fraction of the water inside
+    the letter, as a smooth function of particle positions (`cortado.environments.terms.Share`).
     """
 
     half = 0.3
@@ -286,7 +296,7 @@ class Splash(Task):
     coarse_spacing, coarse_step = half / 12, 0.003
     goal_names: ClassVar[tuple[str, ...]] = ("x of the stem [m]",)
     gravity, strength, lag = 9.81, 12.0, 0.05
-    """Gravity and greatest acceleration of the box [m/s2], and time constant of the acceleration [s]."""
+    """Gravity [m/s2], greatest acceleration of the box [m/s2], and time constant of the acceleration [s]."""
     actuators = (Position("gravity", (0.0, -gravity), (0, 1), (-strength, -strength), lag=lag),)
     goals = np.array([0.0]), np.array([1.5 * half])
 
@@ -321,9 +331,9 @@ class Letter:
 class Stir(Task):
     """The task of stirring a cup of coffee until milk from one corner is spread everywhere.
 
-    The actions are target positions of the spoon, which is a disc in the plane. The reward compares mean distances of
-    pairs of particles, where a distance is |dx| + |dy|. It is the mean distance of milk particles, divided by the
-    initial mean distance of all particles, minus 1.
+    The actions are target positions of the spoon, which is a disc in the plane. The distance of two particles is
+    measured as |dx| + |dy|. The reward is the mean distance of pairs of milk particles, divided by the initial mean
+    distance of all pairs of particles, minus 1.
 
     The task follows Mixing of FluidLab (Xian et al. 2023). Its reward differs by a factor.
     """
@@ -332,7 +342,7 @@ class Stir(Task):
     horizon, repeats, lowest = 50, 16, -1.0
     coarse_spacing, coarse_step = 0.005, 0.001
     width, depth, milky = 0.08, 0.045, 0.02
-    """Width of the cup, depth of the fluid, and size of the region with milk in its left half [m]."""
+    """Width of the cup, depth of the fluid, and size of the region with milk in the left half of the cup [m]."""
     spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
     """Initial position of the spoon [m], radius [m], greatest displacement [m], and time constant of the motion [s]."""
     actuators = (Position("spoon.displacement", (0.0, 0.0), (0, 1), reach, lag=lag),)
@@ -364,8 +374,8 @@ TASKS = {one.name: one for one in _TASKS}
 
 
 def task_of(task: str | Task, size: str | None) -> Task:
-    """Return the task with a name and a size, by default "small", or a user-defined `Task`. Raises `InputError` for an
-    unknown name or size, or if a size is given together with a `Task`."""
+    """Return a task of the catalogue by name and size. The default size is "small". A user-defined `Task` is returned
+    unchanged. Raises `InputError` for an unknown name or size, or if a size is given together with a `Task`."""
     if isinstance(task, Task):
         if size is not None:
             raise InputError(f"size is {shown(size)}, but must be left out, as the task is a Task object.")

@@ -44,14 +44,14 @@ class Twin:
         self._start = {"initial_positions": start.positions} if state is None else {}
         each = zip(task.actuators, begun, strict=True)
         self.coordinates = {one.parameter: one.over(count, m, task.time_step, now) for one, now in each}
-        """Maps from each actuator's actions to its parameter."""
+        """Affine map from the actions of each actuator to its parameter, by parameter name."""
         goal = start.goal[None]
         loss = Frames({k * m: MinusReward(scenes.reward, goal, done + k) for k in range(1, count + 1)})
         self.problem = Problem(scenes.single, count * m, loss, state=restart)
         """The loss as a function of the scene's parameters."""
         fixed: Any = FixedParameters(self.problem, self._start) if self._start else self.problem
         self.search = Transformed(fixed, self.coordinates)
-        """The loss as a function of the actions for `cortado.optimise`, by parameter name."""
+        """The loss as a function of the actions, for `cortado.optimise`. The actions are arrays by parameter name."""
         self.shape = count, sum(len(one.axes) for one in task.actuators)
         """Shape of the actions, (actions, a)."""
 
@@ -153,7 +153,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Slices of an observation by the names of its parts."""
+        """The slice of an observation that contains each observed quantity, by name."""
         return self.scenes.layout
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
@@ -196,14 +196,15 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return pictures(self.scenes)[0] if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return the state of the episode and of the random generator for `restore`. It can be restored several times,
-        also in different environments of the same task. Raises `InputError` before the first `reset`."""
+        """Return the state of the episode and of the random generator for `restore`. The saved state can be restored
+        several times, also in different environments of the same task. Raises `InputError` before the first `reset`."""
         if not self._begun and not self._envs.closed:
             raise InputError("save is called before the first reset(), but must come after it.")
         return self._envs.save()
 
     def restore(self, state: EnvState) -> Observation:
-        """Return to a saved state and return its observation. Raises `InputError` for another task, batch or scene."""
+        """Go back to a saved state, and return its observation. Raises `InputError` for a state of another task, batch
+        or scene."""
         self._envs._generators = [self.np_random]
         seen: Observation = self._envs.restore(state)[0]
         self._begun, self._envs._horizon = True, self.scenes.task.horizon  # a wrapper does not know its step number
@@ -216,7 +217,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
 
 
 class FluidVectorEnv(VectorEnv):
-    """A Gymnasium vector environment of a batch of scenes, with the bits of single ones with the same seeds."""
+    """A Gymnasium vector environment of a batch of scenes. The results are bitwise equal to single environments with
+    the same seeds."""
 
     def __init__(
         self,
@@ -260,15 +262,15 @@ class FluidVectorEnv(VectorEnv):
 
     @property
     def layout(self) -> dict[str, slice]:
-        """Slices of an observation by the names of its parts."""
+        """The slice of an observation that contains each observed quantity, by name."""
         return self.scenes.layout
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Begin all episodes, or the episodes chosen by ``options={"reset_mask": mask}`` with a bool array (num_envs,).
-        If ``seed`` is a number, environment b gets the seed + b. With ``options={"state": state}`` the environments
-        return to a saved state."""
+        """Begin all episodes, or only the episodes in a bool array (num_envs,), given as ``options={"reset_mask":
+        mask}``. If ``seed`` is a number, environment b gets the seed ``seed + b``. With ``options={"state": state}``
+        the environments return to a saved state."""
         self._require_open("reset")
         if (state := saved_option(options, seed, "reset_mask")) is not None:
             return self.restore(state), {}
@@ -330,13 +332,15 @@ class FluidVectorEnv(VectorEnv):
         return tuple(pictures(self.scenes)) if self.render_mode else None
 
     def save(self) -> EnvState:
-        """Return the state of all episodes and random generators. Its index selects episodes: ``state[[0, 0, 2]]``."""
+        """Return the state of all episodes and random generators. Indexing selects episodes, such as ``state[[0, 0,
+        2]]``."""
         self._require_open("save")
         random = [one.bit_generator.state for one in self._generators]
         return self.scenes.save(self._over, self._observations, random)
 
     def restore(self, state: EnvState) -> Observation:
-        """Return to a saved state with as many environments, and return its observations. See `FluidEnv.restore`."""
+        """Go back to a saved state, and return its observations. The state must have the same number of environments.
+        See `FluidEnv.restore`."""
         self._require_open("restore")
         self.scenes.restore(state)
         for generator, own in zip(self._generators, state.generators, strict=True):

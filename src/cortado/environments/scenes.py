@@ -1,6 +1,7 @@
 """Step many scenes of one task together, and save and restore their states.
 
-On a CPU, only launches with few particles are captured as graphs. A batch of medium size is therefore split.
+On a CPU, only launches with few particles are captured as graphs. A batch of medium size is therefore split into
+several launches.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -35,10 +36,10 @@ from cortado.simulation import Simulation
 
 JITTER = 0.02
 LANES = 1
-"""Number of lanes per particle. It is fixed so that batches of all sizes have equal bits."""
+"""Number of threads per particle. The number is fixed, so that results are bitwise equal for all batch sizes."""
 SEEN = 32
 MOST_PARTS = 16
-"""Greatest number of launches for a batch. Larger batches use all cores without graphs."""
+"""Greatest number of parts of a batch. A larger batch is not split, and uses all cores without graphs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +53,13 @@ class Start:
 class EnvState:
     """The saved state of an environment or a batch, returned by `save` and accepted by `restore`.
 
-    The state shares device arrays with the environment, which no step overwrites. Pickles have NumPy arrays.
+    The saved state shares device arrays with the environment. No step overwrites these arrays. A pickled state contains
+    NumPy arrays instead.
     """
 
     kind: str
-    """Text with the number of scenes, task, size, precision and observation. `restore` needs the same text."""
+    """Text with the number of scenes, task, size, precision and observation. `restore` requires equal texts of state
+    and environment."""
     scene: Scene
     fields: Mapping[str, Any]
     """Fields of the fluid by name (scenes * n,), as Warp or NumPy arrays."""
@@ -132,7 +135,8 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """A stepper that advances parts of a batch by ``steps`` steps each. The split does not change any bits."""
+    """A stepper that splits a batch into parts and advances each part by ``steps`` steps. The split does not change the
+    results in any bit."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
         scenes = simulation.batch or 1

@@ -47,11 +47,13 @@ class StableBaselinesVecEnv(VecEnv):
     """A batch of environments of one task as a `VecEnv` of Stable-Baselines3. `docs/environments.md` describes it.
 
     When an episode ends, a new episode begins in the same step. ``infos[b]["terminal_observation"]`` is then the last
-    observation of the ended episode of environment b. ``infos[b]["TimeLimit.truncated"]`` is True unless it diverged.
+    observation of the ended episode of environment b. ``infos[b]["TimeLimit.truncated"]`` is True unless the episode
+    diverged.
     """
 
     def __init__(self, task: str | Task, num_envs: int = 1, **settings: Any):
-        """Make ``num_envs`` environments of a task, such as "Carry", with ``settings`` of `FluidVectorEnv`."""
+        """Make a batch of ``num_envs`` environments of a task, such as "Carry". ``settings`` are further arguments of
+        `FluidVectorEnv`."""
         if "autoreset_mode" in settings:
             raise InputError("autoreset_mode is given, but must be left out, as Stable-Baselines3 has only one mode.")
         self.envs = FluidVectorEnv(task, num_envs, **settings, autoreset_mode="SameStep")
@@ -61,7 +63,7 @@ class StableBaselinesVecEnv(VecEnv):
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
 
     def reset(self) -> Observation:
-        """Begin all episodes with the seeds of `seed` and the options of `set_options`, which are used once."""
+        """Begin all episodes. The seeds from `seed` and the options from `set_options` are used only once."""
         options = self._options[0]
         if any(one is not options and one != options for one in self._options):
             raise InputError("options differ from environment to environment, but must be the same for a whole batch.")

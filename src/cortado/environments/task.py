@@ -1,4 +1,4 @@
-"""Base classes of control tasks. An `Actuator` converts actions to the values of a parameter over time, which are an
+"""Base classes of control tasks. An `Actuator` converts actions to values of a parameter over time. The values are an
 affine function of the actions. Actions are numbers from -1 to 1, constant during an environment step."""
 
 from abc import ABC, abstractmethod
@@ -19,16 +19,17 @@ from cortado.simulation import Simulation
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """An actuator sets components of a parameter to actions times ``greatest``, interpolated linearly in steps."""
+    """An actuator converts actions to components of a parameter. The command is the action times ``greatest``. During
+    an environment step the command changes linearly from its last value."""
 
     parameter: str
     """Name of the driven parameter, such as "cup.displacement"."""
     rest: tuple[float, ...]
-    """Value of the parameter before any action (d,). A scalar parameter has one entry."""
+    """Value of the parameter before any action (d,). A scalar parameter has one component."""
     axes: tuple[int, ...]
     """Indices of the driven components (a,)."""
     greatest: tuple[float, ...]
-    """Commands of the actions 1 (a,)."""
+    """Command of each driven component for an action of 1 (a,)."""
     is_number: bool = False
     """True if the parameter is a scalar, such as an angle in the plane."""
 
@@ -70,7 +71,8 @@ class Actuator(ABC):
 
 @dataclass(frozen=True)
 class Velocity(Actuator):
-    """An actuator with velocities as actions, in m/s or rad/s: the command is the driven component's derivative."""
+    """An actuator with velocities as actions, in m/s or rad/s. The command is the time derivative of the driven
+    component."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step * command
@@ -78,7 +80,8 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """An actuator with target values as actions: the driven component approaches them with the time ``lag``."""
+    """An actuator with target values as actions. The driven component approaches its target with the time constant
+    ``lag``."""
 
     lag: float = 0.1
     """Time constant of the actuator [s]."""
@@ -89,13 +92,14 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """The base class of control tasks: a scene, actuators, a reward and goals, in a small and a large size."""
+    """The base class of control tasks. A task has a scene, actuators, a reward and goals, in a small and a
+    large size."""
 
     size: str = "small"
     """"small", for a CPU, or "large", for a GPU. The large size has `finer` times as many particles along each axis."""
     dimension: ClassVar[int] = 2
     finer: ClassVar[int] = 3
-    """Ratio of the spacings, and of the time steps, of the small and the large size."""
+    """Spacing of the small size divided by the spacing of the large size. The time steps have the same ratio."""
     name: ClassVar[str]
     horizon: ClassVar[int]
     """Number of environment steps before an episode is truncated."""
@@ -167,7 +171,7 @@ class Task(ABC):
 
 
 def checked_scene(task: Task) -> Scene:
-    """Return the scene of a task. Raises `InputError` if its time step differs from the task's."""
+    """Return the scene of a task. Raises `InputError` if the scene and the task have different time steps."""
     scene = task.scene
     found, wanted = scene.solver.time_step, task.time_step
     if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):

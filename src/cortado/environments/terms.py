@@ -122,12 +122,14 @@ class OverParticles:
 
 class Share(OverParticles):
     """A reward term: the fraction of the fluid in boxes, as a smooth function of particle positions. The weight of a
-    particle is 1 inside a box and 1/2 at the distance ``width`` from the nearest box. Its gradient is not 0 outside."""
+    particle is 1 inside a box and 1/2 at the distance ``width`` from the nearest box. Outside the boxes the gradient of
+    the weight is therefore not 0."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes and their width [m]. With a ``solid`` they move, and turn about z alone."""
+        """Set the boxes, and the ``width`` [m] of the smooth transition around them. If a ``solid`` is given, the boxes
+        move with the solid. The solid may turn only about z."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -163,7 +165,8 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` of chosen particles' nearest images, over ``everywhere``."""
+    """A reward term: the mean distance ``|dx| + |dy|`` of pairs of chosen particles, divided by the length
+    ``everywhere``. Distances are between nearest periodic images."""
 
     kernel = "apart"
 
@@ -185,12 +188,13 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """A reward term: the weighted sum of squared distances from targets of each step, without periodic images."""
+    """A reward term: the weighted sum of squared distances of particles from their targets in the current step.
+    Periodic images are ignored."""
 
     kernel = "missed"
 
     def __init__(self, targets: NDArray, weights: NDArray):
-        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n). The first entry is for step 1."""
+        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n). Index 0 is for step 1."""
         super().__init__(targets, weights)
         self._targets, self._weights = targets, weights
 

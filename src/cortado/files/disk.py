@@ -33,7 +33,8 @@ OTHERS = (
 
 
 def as_path(what: str, value: Any) -> str:
-    """Return a path as text. Raises `InputError` for any other type. Python would interpret numbers as open files."""
+    """Return a path as text. Raises `InputError` for any other type. Numbers are errors too, because Python interprets
+    them as open files."""
     if isinstance(value, (str, os.PathLike)):
         path = os.fspath(value)
         if isinstance(path, str) and path:
@@ -56,8 +57,9 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
 
 
 def cached_by_file(kept: int, most: int) -> Callable[[Callable[..., Found]], Callable[..., Found]]:
-    """Decorate a function of a file's path, and cache its last results until the file changes. The function raises
-    `InputError` if the file is not regular or is larger than ``most`` bytes."""
+    """Return a decorator for functions of a file's path. The decorator caches the last results of a function until the
+    file changes. The decorated function raises `InputError` if the file is not regular or is larger than ``most``
+    bytes."""
 
     def decorated(read: Callable[..., Found]) -> Callable[..., Found]:
         known = lru_cache(kept)(lambda version, path, *more: read(path, *more))
@@ -97,8 +99,8 @@ MOST_BYTES = 2**28
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. An empty entry is NaN.
-    Raises `InputError` if the file is no such table."""
+    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. An empty cell is NaN.
+    Raises `InputError` if the file is not a valid table."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]
@@ -172,7 +174,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Test whether a path exists, even as a broken link. Raises `InputError` if the test fails."""
+    """Test whether a path exists. A broken link also counts as existing. Raises `InputError` if the test fails."""
     with sentences(path):
         try:
             path.lstat()
@@ -198,8 +200,8 @@ def parsed_json(text: bytes) -> Any:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Replace an `OSError` by an error with a clear message: `ComputationError` for a full or broken disk, or
-    `InputError`."""
+    """Replace an `OSError` by an error with a clear message. The error is `ComputationError` for a full or broken disk,
+    and `InputError` otherwise."""
     try:
         yield
     except OSError as problem:
@@ -217,7 +219,7 @@ def make_folder(path: Path) -> None:
 
 
 BEYOND = 2**30
-"""Offset of the locked byte on Windows. It is far behind the content, so that the file remains readable."""
+"""Offset of the locked byte on Windows. The byte is far behind the content, so that the file remains readable."""
 
 
 def lock(file: int) -> None:

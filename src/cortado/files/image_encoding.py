@@ -22,7 +22,8 @@ from cortado.files.terminal import held
 
 ROWS = 32
 MOST_LIGHT = 2.0
-"""Greatest value in a linear picture from a user. Pictures with larger values probably contain bytes up to 255."""
+"""Greatest value in a linear picture from a user. Pictures with larger values probably contain byte values from 0 to
+255."""
 STEPS = 1 << 14
 """Number of intervals of linear light from 0 to 1. Each interval contains at most one boundary between byte values."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
@@ -40,8 +41,8 @@ def check_light(what: str, image: ArrayLike) -> None:
 
 def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
     """Return the sRGB bytes of a linear image (rows, columns, 3). Light is clipped to the range from 0 to 1. ``each``
-    maps a function over parts of the image. Raises `InputError` for a wrong shape and for values that are not finite.
-    """
+    is a function like `map`, which is used for the parts of the image. Raises `InputError` for a wrong shape and for
+    values that are not finite."""
     light = image if isinstance(image, np.ndarray) and image.dtype == np.float32 else as_numbers("The image", image)
     if light.ndim != 3 or light.shape[2] != 3 or not light.size:
         raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
@@ -69,8 +70,8 @@ def srgb_bytes(light: NDArray[Any]) -> NDArray[np.uint8]:
 
 @cache
 def _steps(dtype: np.dtype[Any]) -> tuple[NDArray[Any], NDArray[np.uint8]]:
-    """Return the least light of each byte value (256,), and the byte value at the start of each interval
-    (STEPS + 1,)."""
+    """Return the least linear light that gives each byte value (256,). Also return the byte value at the start of each
+    interval (STEPS + 1,)."""
     middles = (np.arange(1, 257) - 0.5) / 255.0
     exact = np.where(middles <= 0.04045, middles / 12.92, ((middles + 0.055) / 1.055) ** 2.4)
     rounded = exact.astype(dtype)
@@ -95,8 +96,8 @@ def png(image: ArrayLike) -> bytes:
 
 
 class ShadedPicture(np.ndarray):
-    """A linear picture (rows, columns, 3) with values from 0 to 1. It is a NumPy array that notebooks show as a
-    picture. Use `cortado.pictures.write_picture` to save it."""
+    """A linear picture (rows, columns, 3) with values from 0 to 1. Notebooks show this NumPy array as a picture. Use
+    `cortado.pictures.write_picture` to save it."""
 
     @classmethod
     def of(cls, image: ArrayLike) -> Self:
@@ -116,7 +117,7 @@ TICKS = 90_000
 
 
 class Video:
-    """A video file to which frames are added. Use `writing` to open one."""
+    """A video file to which frames are added. Use `writing` to open a video file."""
 
     def __init__(self, container: Any, frames_per_second: float):
         from av.video.reformatter import VideoReformatter
@@ -128,8 +129,8 @@ class Video:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame that is shown from ``time`` [s] on. An odd number of rows or columns is made even by repeating
-        the last one."""
+        """Add a frame that is shown from ``time`` [s] on. If the number of rows or columns is odd, the last row or
+        column is repeated."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)
@@ -190,8 +191,8 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
     continues after the finished frames.
 
     Args:
-        path: ends in .mp4.
-        frames_per_second: approximate rate; each frame has its own time.
+        path: path of the file, which ends in .mp4.
+        frames_per_second: approximate frame rate. The exact time of each frame is stored.
         note: text that identifies the content; it is stored in the file.
         count: number of frames of the complete video.
 

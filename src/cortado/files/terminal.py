@@ -91,8 +91,8 @@ def to_stdout() -> Iterator[None]:
 
 
 def steady_streams() -> None:
-    """Make stdout and stderr usable. Closed streams are replaced by the null device, characters that the terminal lacks
-    are escaped, and errors of stderr are ignored. Writing a result to a closed stdout still fails."""
+    """Make stdout and stderr usable. Closed streams are replaced by the null device. Characters that the terminal lacks
+    are escaped. Errors of stderr are ignored. Writing a result to a closed stdout still fails."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             _point_nowhere(number, os.O_RDONLY if number == 1 else os.O_RDWR)
@@ -135,7 +135,7 @@ def announce(result: str) -> None:
 
 
 Advance = Callable[..., None]
-"""A function that reports ``n`` finished steps, by default one step. It also takes values to show, such as
+"""A function that reports ``n`` finished steps, by default one step. Further arguments are values to show, such as
 ``loss=0.1``."""
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
@@ -185,8 +185,8 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
 
 
 class _Lines:
-    """Progress as lines of text. The estimate of the remaining time ignores the time for compiling kernels before the
-    first report."""
+    """Progress as lines of text. The estimate of the remaining time ignores the time before the first report, when
+    kernels are compiled."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
@@ -238,7 +238,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def leave_at_once() -> None:
-    """End the process at once on later signals. Ignored signals remain ignored, as with nohup."""
+    """End the process at once on later signals. Signals that the process ignores remain ignored, as with nohup."""
     global _stderr
     with suppress(OSError):  # it may be closed
         _stderr = os.dup(2)
@@ -255,8 +255,8 @@ def finish() -> None:
 
 @contextmanager
 def keeping(kept: Callable[[], str]) -> Iterator[None]:
-    """Turn signals into exceptions during the ``with`` block. ``kept`` returns the end of the exception's message,
-    which names the saved results. In nested blocks the innermost non-empty text is used."""
+    """Turn signals into exceptions during the ``with`` block. ``kept`` returns the last part of the exception's
+    message, such as the names of saved files. In nested blocks the innermost text that is not empty is used."""
     ours = [number for number in SIGNALS if signal.getsignal(number) is _leave]
     for number in ours:
         signal.signal(number, _raise)
@@ -315,8 +315,8 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """Return the end of an interruption's message. If the interruption occurred while an earlier one was handled, the
-    earlier message counts."""
+    """Return the last part of an interruption's message. If an earlier interruption was being handled, the message of
+    the earlier one is used."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

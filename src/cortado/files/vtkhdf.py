@@ -2,12 +2,12 @@
 
 The file has room for every frame from the beginning. Every dataset is contiguous, sparse on disk and at a fixed offset.
 `PointOffsets` maps a frame to its data. Datasets that count points and cells have two parts: one for all particles, and
-an empty part for missing frames. A number in `PartOffsets` makes a frame appear, so that readers never see a size
-change.
+an empty part for missing frames. `PartOffsets` selects one of the parts for each frame. Changing this number makes a
+frame appear, so that readers never see a change of size.
 
 HDF5 only creates the file in memory, because it crashes on a full disk (HDF5 2.0). Plain writes copy the file to disk
 and add frames. One write of eight bytes then stores the number of frames and their CRC-32. HDF5's checksums and its
-mode for one writer and many readers are not used, because VTK cannot open their files after a killed process.
+mode for one writer and many readers are not used. After a killed process VTK cannot open such files.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
 """
@@ -32,7 +32,7 @@ from cortado.errors import ComputationError, InputError
 from cortado.files.disk import sentences, unfinished, write_fully
 
 FORMAT = 3
-"""Version of the file's group "cortado"."""
+"""Version of the format of the file's group "cortado"."""
 WRITTEN, MISSING = 0, 1  # parts of frames
 _TOPOLOGIES = ("Vertices", "Lines", "Polygons", "Strips")
 _PAGE = 4096
@@ -58,7 +58,8 @@ class FileLayout:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     origin: str = ""
     marks: tuple[float, ...] = ()
-    """Time of the first frame [s] and frames per second [1/s]. Empty if frames are chosen by number of steps."""
+    """Time of the first frame [s] and frames per second [1/s]. The tuple is empty if frames are chosen by number of
+    steps."""
 
     def __post_init__(self) -> None:
         own: dict[str, Any] = {"times": np.array(self.times, dtype=np.float64, ndmin=1)}
@@ -84,7 +85,8 @@ class FileLayout:
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
-        """Shape of each dataset's entries by name, in the order of the checksum."""
+        """Shape of one particle's values in each dataset, by the dataset's name. The datasets are in the order of the
+        checksum."""
         fields: dict[str, tuple[int, ...]] = dict.fromkeys(("velocity", *self.vectors), (3,))
         fields |= dict.fromkeys(self.scalars, ())
         return {"VTKHDF/Points": (3,)} | {f"VTKHDF/PointData/{name}": fields[name] for name in sorted(fields)}
@@ -166,8 +168,8 @@ class FileLayout:
 
 
 def frames_seed(shape: tuple[int, int], kinds: Kinds, constants: Arrays, origin: str, marks: tuple[float, ...]) -> int:
-    """Return the initial checksum, before any frame. It depends on the types and shapes of the fields and on the
-    constants."""
+    """Return the initial checksum, before any frame. The checksum depends on the types and shapes of the fields and on
+    the constants."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
@@ -363,9 +365,10 @@ def read(path: str | Path) -> dict[str, Any]:
     """Read the complete frames and steps, also during a run and after a killed run.
 
     Returns:
-        times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s], and every
-        scalar field (frames, n) by name. Tables by name: others (arrays of every frame), constants (arrays of the run),
-        diagnostics (steps,). Also origin, a text, and marks, None or two numbers.
+        A table with times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d)
+        [m/s], and every scalar field (frames, n). The keys others, constants and diagnostics have tables of arrays by
+        name. The arrays in others are of every frame, in constants of the run, and in diagnostics of every step
+        (steps,). The key origin has a text. The key marks has None or two numbers.
 
     Raises:
         InputError: the file is missing, damaged, or not a trajectory of Cortado.

@@ -30,7 +30,7 @@ def estimate(
     estimator: GradientEstimator | None = None,
     observe: Observer | None = None,
 ) -> Estimate:
-    """Return the loss of a problem and its gradient by an estimator, `Exact` by default.
+    """Return the loss of a problem, and its gradient computed by an estimator. The default estimator is `Exact`.
 
     ``parameters`` are values by name. ``observe`` is called with the number and the adjoint of each state. Raises
     `InputError` if ``estimator`` is not an estimator, or if its result lacks the gradient of a parameter.

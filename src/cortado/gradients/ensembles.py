@@ -31,18 +31,18 @@ _RUN = 1000.0
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The settings of a random ensemble around given parameters.
+    """A random ensemble around given parameters.
 
-    The N components of all parameters, divided by their spreads, are drawn from a ball of radius sqrt(N). A normal
-    random number is added to every coordinate of the initial positions. Samples come in antithetic pairs and are the
-    same in every call.
+    Let N be the number of components of all parameters. The deviations from the given parameters, divided by their
+    spreads, are drawn from a ball of radius sqrt(N). A normal random number is added to every coordinate of the initial
+    positions. Samples come in antithetic pairs and are the same in every call.
     """
 
     spread: float | Mapping[str, float] = 0.5
     """Width of the ensemble in each parameter, in the unit of the parameter: one number, or a table by name. The width
     is sqrt((N + 2) / N) times the standard deviation of a component, where N is the number of components."""
     samples: int = 8
-    """Number of samples, at most 100,000. All results are held in memory."""
+    """Number of samples, at most 100,000. The memory must have room for all results."""
     position_noise: float = 0.01
     """Standard deviation of the perturbations of initial positions [spacings]."""
     seed: int = 0
@@ -65,8 +65,8 @@ class Ensemble:
         keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
-        """Return the ensemble around the parameters of a problem. Each ``draw`` has independent samples. Raises
-        `InputError` for a batch, for no parameters, and for spreads below round-off."""
+        """Return the ensemble around the parameters of a problem. Different numbers ``draw`` give independent samples.
+        Raises `InputError` for a batch, for no parameters, and for spreads below round-off."""
         if problem.simulation.batch is not None:
             said = f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene"
             raise InputError(f"{said}, whose samples it runs in batches of its own.")
@@ -92,7 +92,7 @@ class Ensemble:
         return evaluated(problem, points, self.executor if observe is None else InProcess(), observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
-        """Raise `InputError` unless the memory suffices for ``runs`` results with ``numbers`` components each."""
+        """Raise `InputError` if the memory is too small for ``runs`` results with ``numbers`` components each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
 
@@ -121,7 +121,8 @@ class Sampler:
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Point:
-        """Return a sample with parameters moved by ``u`` (numbers,) spreads, and with displaced initial positions."""
+        """Move the parameters by ``u`` (numbers,) times their spreads, displace the initial positions, and return the
+        sample."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
@@ -149,7 +150,7 @@ class LeftOutWarning(CortadoWarning):
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
     """Return a mask (members,) of the members without a failed run, and warn about failed members. If more than a
-    quarter failed, raise the first run's error. ``what`` names the members in the plural."""
+    quarter failed, raise the error of the first failed run. ``what`` names the members in the plural."""
     errors = [getattr(one, "diverged", None) for one in runs]  # an estimator of one's own may return anything
     lost = np.array([error is not None for error in errors], dtype=bool).reshape(members, -1)
     kept = np.array([not any(member) for member in lost], dtype=bool)
@@ -174,8 +175,8 @@ MOST_NUMBERS = 64
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Ensemble):
-    """A gradient estimator: central differences averaged over an ensemble of parameters and initial states. It is the
-    reference for long runs.
+    """A gradient estimator: central differences averaged over an ensemble of parameters and initial states. The
+    estimator is the reference for long runs.
 
     Formula: let u be the parameters with N components, each divided by its spread, and L the loss. The gradient is
 
@@ -187,8 +188,9 @@ class RandomizedSmoothing(Ensemble):
     Bias: the average removes features of the loss narrower than the spread, as intended. Noise: the ``standard_error``
     of the `Estimate`. Cost: 2 N forward runs per sample, so N should be a few dozen at most.
 
-    Runs that diverge: their differences are left out, up to a quarter of all differences. The sum over the remaining
-    differences of the sample is scaled up. The scaling adds no bias if all directions diverge equally often.
+    Runs that diverge: a difference with a diverged run is left out, up to a quarter of all differences. The sum over
+    the remaining differences of the sample is scaled up. The scaling adds no bias if all directions diverge equally
+    often.
 
     ``position_noise`` is the standard deviation of the displacements of initial positions, in spacings. ``seed`` is the
     seed of the random numbers. ``executor`` computes the runs.
@@ -237,13 +239,13 @@ class EnsembleMean(Ensemble):
     is the gradient of `RandomizedSmoothing`, but the cost does not depend on the number of parameters. For long runs,
     do not average `Exact` gradients, because the largest few dominate the mean.
 
-    Bias: the estimator's bias. The perturbations of the initial positions add a bias if the loss is as small as their
-    effect. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients and one forward run.
+    Bias: the estimator's bias. Perturbed initial positions add a bias if their effect on the loss is as large as the
+    loss. Noise: the ``standard_error`` of the `Estimate`. Cost: ``samples`` gradients and one forward run.
 
     Samples that diverge: the whole antithetic pair is left out, up to a quarter of all pairs. The remaining samples are
     symmetric about the parameters, so that the mean is not shifted.
 
-    ``spread`` is the width of the ensemble in the units of the parameters, for all parameters or by name.
+    ``spread`` is the width of the ensemble in the units of the parameters: one number, or a table by parameter name.
     ``position_noise`` is the standard deviation of the displacements of initial positions, in spacings. ``seed`` is the
     seed of the random numbers. ``executor`` computes the runs.
 
@@ -281,7 +283,8 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean of gradients (samples, numbers) of adjacent antithetic pairs, and its standard error."""
+        """Return the mean of gradients (samples, numbers) and its standard error. Adjacent gradients are antithetic
+        pairs."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
@@ -291,7 +294,8 @@ def require_pairs(samples: int) -> None:
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the samples and its standard error, without overflow, or NaN for infinite samples."""
+    """Return the mean of the samples and its standard error, computed without overflow. The results are NaN for
+    infinite samples."""
     size = np.abs(samples).max(initial=0.0)
     unit = size if 0.0 < size < np.inf else 1.0
     with np.errstate(invalid="ignore"):
@@ -313,19 +317,20 @@ class Guided(Ensemble):
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
     where L is the loss, u are the parameters, and N_k is the number of non-zero components of part k. The two losses of
-    a difference have the same perturbed initial positions. So g projects the smoothed gradient onto the span of the
-    parts. Source: guided evolution strategies (Maheswaranathan et al. 2019), without their search outside the span.
+    a difference have the same perturbed initial positions. g is therefore the projection of the smoothed gradient onto
+    the span of the parts. Source: guided evolution strategies (Maheswaranathan et al. 2019), without their search
+    outside the span.
 
     Bias: directions outside the span of the parts are missed. The size of each part is correct for the smoothed loss.
     Noise: the ``standard_error`` combines the errors of D_k and p_k, with degrees of freedom by Welch and
     Satterthwaite. Cost: ``samples`` gradients of the surrogate and 1 + 2 K ``differences`` forward runs, for any number
     of parameters.
 
-    Runs that diverge: runs of the surrogate are treated as in `EnsembleMean`. A sample of the differences is left out
-    as a whole, so that all D_k average the same samples. At most a quarter of the samples may be left out, and none of
-    fewer than 4.
+    Runs that diverge: runs of the surrogate are treated as in `EnsembleMean`. If a difference fails, its sample is left
+    out of all D_k, so that all D_k average the same samples. At most a quarter of the samples may be left out. With
+    fewer than 4 samples, no sample may be left out.
 
-    ``spread`` is the width of the ensemble in the units of the parameters, for all parameters or by name.
+    ``spread`` is the width of the ensemble in the units of the parameters: one number, or a table by parameter name.
     ``position_noise`` is the standard deviation of the displacements of initial positions, in spacings. ``seed`` is the
     seed of the random numbers. ``executor`` computes the runs.
 
@@ -381,7 +386,6 @@ class Guided(Ensemble):
         return Estimate(surrogate.loss, gradient, error, freedom, surrogate.mean_loss, left_out)
 
     def _parts(self, ensemble: Sampler, gradient: Arrays, error: Arrays) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the directions (numbers,), of length 1, and errors of the parts of a gradient that are not 0."""
         numbers = []  # of the part of each component
         for k, value in enumerate(ensemble.values.values()):
             rows = len(value) if value.ndim > 1 else 1

@@ -32,9 +32,9 @@ class Estimate:
     mean_loss: float | None = None
     """Mean of the loss over the ensemble."""
     left_out: int = 0
-    """Number of runs missing from the average. They failed, or their antithetic partners failed."""
+    """Number of runs missing from the average, because the run or its antithetic partner failed."""
     diverged: Exception | None = None
-    """Error of a failed point of `cortado.evaluate` (`NO_RUN`), whose loss and gradient are NaN."""
+    """Error of a point that failed in `cortado.evaluate`. The loss and the gradient are then NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """Return the lower and the upper ends of confidence intervals for the gradient, by parameter name.
@@ -76,7 +76,8 @@ class ForwardPass(Protocol):
         """Loss of the run."""
 
     def back(self, estimator: "AdjointEstimator", observe: Observer | None = None) -> Arrays:
-        """Return the gradient by an estimator. ``observe`` sees each state's number and adjoint, from the last."""
+        """Return the gradient by an estimator. ``observe`` is called with the number and the adjoint of each state,
+        from the last state to the first."""
 
 
 class Differentiable(Protocol):
@@ -102,8 +103,8 @@ class Batchable(Protocol):
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
         """Return estimates at several points, computed in one launch. All points have the same parameter names and
-        shapes. The results are bitwise equal to separate runs. Without an estimator the estimates have only the loss. A
-        point that loses a particle returns its error."""
+        shapes. The results are bitwise equal to separate runs. Without an estimator the estimates have only the loss.
+        For a point with a lost particle, the result is the error."""
 
 
 class GradientEstimator(Protocol):
@@ -127,8 +128,8 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """Return the result of an estimator in float64. Raises `InputError` unless the result has a gradient of every
-    parameter in the right shape. In a batch the first axis of a gradient is the scene."""
+    """Return the result of an estimator in float64. Raises `InputError` if a parameter has no gradient, or a gradient
+    of wrong shape. In a batch the first axis of a gradient is the scene."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -149,7 +150,8 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """True if the estimator can differentiate batches. Override this property if it never mixes scenes."""
+        """True if the estimator can differentiate batches. A subclass may override this property if its gradients never
+        mix scenes."""
         return False
 
     @abstractmethod
@@ -167,7 +169,7 @@ class AdjointEstimator(ABC):
 
 
 class Filtered:
-    """A backward step that also filters the adjoint. It wraps the backward step of a given estimator."""
+    """A backward step that filters the adjoint after the backward step of a given estimator."""
 
     only_launches: ClassVar[bool] = False
     """True if `filter` only ever launches the same kernels, so that a CUDA graph can capture the backward step."""
@@ -192,7 +194,7 @@ class Filtered:
 
 
 NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
-"""Errors of a point without a result, after which the remaining points are still evaluated."""
+"""Errors of a point that has no result. The remaining points are still evaluated."""
 
 
 @dataclass(frozen=True)
@@ -204,9 +206,10 @@ class Point:
     """Gradient estimator, or None to compute only the loss."""
     loss_if_diverged: float = np.nan
     errors: tuple[type[Exception], ...] = ()
-    """Errors that are replaced by a substitute loss."""
+    """Types of errors that are replaced by a substitute loss."""
     is_sample: bool = False
-    """True for a sample of an ensemble. Its estimate is not checked, and an `InputError` says that it is a sample."""
+    """True for a sample of an ensemble. The estimate of a sample is not checked. An `InputError` mentions that the
+    point is a sample."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
         """Return the loss and the gradient at the point. Without an estimator the gradient is empty."""

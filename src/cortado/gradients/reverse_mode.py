@@ -53,7 +53,8 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def crowd(s, x, most):
-        """Store the sum of the smoothing kernel over neighbours, or a lower bound if the sum is smaller."""
+        """Store the sum of the smoothing kernel over the neighbours, but at least the kernel at half the support
+        radius."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
@@ -155,7 +156,8 @@ class Exact(AdjointEstimator):
 class Tape(AdjointEstimator):
     """A gradient estimator: the exact adjoint by Warp's automatic differentiation of the forward kernels.
 
-    It serves as a check of `Exact`, is slower, uses atomics on a GPU, and works only with the solver ``"pcisph"``.
+    The estimator serves as a check of `Exact`. It is slower than `Exact`, uses atomics on a GPU, and works only with
+    the solver ``"pcisph"``.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Tape())``
     """
@@ -223,20 +225,20 @@ class AdjointViscosity(AdjointEstimator):
 
     Why: an adjoint grows exponentially at the scale of particles, while the response to a parameter has the scale of
     the fluid. The viscosity damps short waves of the adjoint much more than long waves. The growth rate of the adjoint
-    follows the strain rate of the forward flow. So one coefficient fits all flows, and calm flow is not damped.
+    follows the strain rate of the forward flow. Therefore one coefficient suits all flows, and calm flow is not damped.
 
     Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. Without
-    this limit, the adjoints of a few particles may grow faster than the viscosity spreads them. A flow without strain
-    has no limit.
+    this limit, the adjoints of a few particles may grow faster than the viscosity spreads them. In a flow without
+    strain the adjoints are not limited.
 
     Long waves are slightly damped too, which affects gradients with respect to early steps most. ``order=2``
     extrapolates the gradients g(C) and g(2 C) of two coefficients C and 2 C to zero viscosity (Richardson): the result
     is 2 g(C) - g(2 C).
 
-    Bias: short waves of the adjoint are lost and long waves are weakened, so gradients of long runs are too small.
-    Gradients of a loss of single particles are poor, because they have no long waves. Noise: order 2 has more noise, so
-    use it with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with three more neighbour
-    sums per step.
+    Bias: short waves of the adjoint are lost and long waves are weakened, so gradients of long runs are too small. If a
+    loss depends on single particles, its gradient is poor, because the adjoint has no long waves. Noise: order 2 has
+    more noise, so use it with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with three
+    more neighbour sums per step.
 
     Sources: Smagorinsky (1963) for a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) for an eddy
     viscosity of the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
@@ -246,7 +248,7 @@ class AdjointViscosity(AdjointEstimator):
     """
 
     coefficient: float = 2.0
-    """Coefficient of the viscosity, at least 0. With 0 the gradient is the same as that of `Exact`."""
+    """Coefficient of the viscosity, at least 0. With 0 the gradient is the same as with `Exact`."""
     limit: float = 4.0
     """Greatest length of a particle's adjoint vector, relative to the root mean square; infinity for no limit."""
     order: int = 1
@@ -272,7 +274,8 @@ class AdjointViscosity(AdjointEstimator):
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
-        """Return the gradient of a forward run's loss. ``observe`` sees only the pass with the smaller coefficient."""
+        """Return the gradient of a forward run's loss. ``observe`` is called only in the pass with the smaller
+        coefficient."""
         once = replace(self, order=1)
         gradient = forward_pass.back(once, observe)
         if self.order == 1:

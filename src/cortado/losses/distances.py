@@ -25,7 +25,7 @@ from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 @cache
 def matching_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return the kernels ``squared_distance``, in float64, and ``difference``, which is multiplied by a factor."""
+    """Return two kernels: ``squared_distance``, in float64, and ``difference``, which also multiplies by a factor."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
     typed = TypesByName(real, {vector: "x target bar", wp.float64: "squares"})
@@ -229,7 +229,8 @@ class Pictures(Protocol):
         """Return the picture (rows, columns, 3) of particles."""
 
     def adjoint(self, image_bar: np.ndarray) -> Any:
-        """Return derivatives ``positions``, ``fractions`` and ``colours``, given that of the last picture."""
+        """Return the derivatives with respect to ``positions``, ``fractions`` and ``colours``, given the derivative
+        with respect to the last picture."""
 
 
 @fixed

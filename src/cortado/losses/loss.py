@@ -26,7 +26,7 @@ def precision_of(state: State) -> Precision:
 
 
 class OnHost:
-    """The arrays of a state of one scene or of a batch. They are copied from the device on first use."""
+    """The arrays of the state of one scene or of a batch, copied from the device on first use."""
 
     state: State
 
@@ -64,7 +64,8 @@ class Snapshot(OnHost):
     colours: np.ndarray
     """Colours of the phases (phases, 3) in linear RGB from 0 to 1."""
     moment: Moment | None = None
-    """State and parameters of the next step, from which particle quantities are computed. None if they are unknown."""
+    """State and parameters of the next step, from which particle quantities are computed. The value is None if they are
+    unknown."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
@@ -109,7 +110,8 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """Return the state and parameters of which quantities are computed. Raises `InputError` if they are unknown."""
+    """Return the state and parameters from which particle quantities are computed. Raises `InputError` if they are
+    unknown."""
     if end.moment is None:
         raise InputError("The state has no simulation, with which quantities are computed: take a state of a run.")
     return end.moment
@@ -192,7 +194,8 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
 class Loss(Protocol):
     """Protocol of a loss, which is a differentiable number computed from the last state of a trajectory.
 
-    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`, for the derivatives alone.
+    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`. The method returns only the
+    derivatives.
     """
 
     def value(self, end: Snapshot) -> float:
@@ -245,7 +248,7 @@ class SnapshotBatch(OnHost, Sequence[Snapshot]):
     """A state of all scenes of a batch. ``end[b]`` is the `Snapshot` of scene b."""
 
     state: State
-    """Warp arrays (batch * n,), scene by scene. `State.numbers` returns arrays (batch, n, ...)."""
+    """Warp arrays (batch * n,), with the scenes one after the other. `State.numbers` returns arrays (batch, n, ...)."""
     dimension: int
     colours: np.ndarray
     """Colours of the phases (batch, phases, 3) in linear RGB from 0 to 1."""

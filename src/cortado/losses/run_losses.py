@@ -25,8 +25,8 @@ class Recorded:
     """A loss made from a function of Warp arrays, differentiated by Warp's tape.
 
     ``function(positions, velocities, loss)`` launches kernels that add to ``loss``. ``loss`` is an array (1,) in the
-    precision of the vectors (n,). Compute a sum in a separate Warp function if its value is used non-linearly, because
-    Warp's derivatives of loops in kernels would be wrong.
+    precision of the vectors (n,). If the value of a sum is used non-linearly, compute the sum in a separate Warp
+    function. Warp's derivatives of loops in kernels would be wrong.
 
     Example::
 
@@ -69,7 +69,8 @@ FORMS = "positions", "velocities", "mass fractions"
 
 
 class CheckedLoss:
-    """A loss with checked values and derivatives. It calls ``adjoint`` if it exists, or else ``value_and_adjoint``."""
+    """A loss with checked values and derivatives. The loss's method ``adjoint`` is called if it exists, or else
+    ``value_and_adjoint``."""
 
     def __init__(self, loss: Any):
         self._loss = loss
@@ -89,7 +90,8 @@ class CheckedLoss:
         return _among(members, [self.value(end[b]) for b in members], len(end))
 
     def values_and_adjoints(self, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
-        """Return the `values` and the derivatives with respect to the states, 0 for scenes outside ``members``."""
+        """Return the `values` and the derivatives with respect to the states. The derivatives are 0 for scenes outside
+        ``members``."""
         found, state, colours = np.full(len(end), np.nan), end.state.like(), np.zeros_like(end.colours)
         quantities: dict[str, np.ndarray] = {}
         for b in members:
@@ -121,10 +123,11 @@ class CheckedLoss:
 
 @runtime_checkable
 class BatchedLoss(Protocol):
-    """Protocol of a loss that is computed for all scenes of a batch together, with the bits of single scenes."""
+    """Protocol of a loss that is computed for all scenes of a batch together. The results must be bitwise equal to the
+    losses of single scenes."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
-        """Return the losses (batch,). The loss of a lost scene is arbitrary."""
+        """Return the losses (batch,). The loss of a diverged scene is arbitrary."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
         """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays. To make them, call
@@ -209,7 +212,7 @@ class LossesByStep(dict[int, CheckedLoss]):
 
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
         """Take a ``loss`` of the last state, or a `Frames` loss. Raises `InputError` for any other object, and for
-        frames beyond ``steps``. If time steps are ``chosen`` during the run, frames at fixed times are errors too."""
+        frames beyond ``steps``. If the run chooses its time steps, frames at fixed times are errors too."""
         if chosen and getattr(loss, "time_step", None) is not None:
             wanted = 'one of numbers of steps, as solver.time_step is "auto"'
             raise InputError(f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be {wanted}.")
@@ -232,7 +235,8 @@ class LossesByStep(dict[int, CheckedLoss]):
         return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Return the sum of losses of states by number of steps: for a batch (batch,), with NaN outside ``going``."""
+        """Return the sum of the losses of the states ``ends``, which are given by number of steps. For a batch the
+        result is an array (batch,), with NaN for scenes outside ``going``."""
         self._check(ends)
         each = ((ends[step], loss) for step, loss in self.items())
         return sum(loss.value(end) if going is None else loss.values(end, going) for end, loss in each)

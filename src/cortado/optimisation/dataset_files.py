@@ -21,9 +21,9 @@ from cortado.version import __version__
 
 METADATA, PARTS, PURPOSES = "metadata.json", "runs", ("train", "valid", "test")
 REACH = 1.6
-"""Connectivity radius of a learned simulator [spacings]."""
+"""Radius within which a learned simulator connects particles [spacings]."""
 SPARE = 1.02
-"""Disk space for assembling runs, relative to the size of the runs."""
+"""Free disk space needed to assemble the runs, relative to the size of the runs."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ class DatasetFolder:
         return max([int(self.metadata.get("runs", 0)), *(number + 1 for number in numbers)])
 
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
-        """Write the files whose runs differ from ``split``, or raise `ComputationError` and change nothing."""
+        """Write the files whose runs differ from ``split``. If writing fails, no file is changed, and
+        `ComputationError` is raised."""
         stale = {}
         for purpose, numbers in split.items():
             path = self.path(purpose)
@@ -152,7 +153,8 @@ class DatasetFolder:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], folder: DatasetFolder, runs: int
 ) -> dict[str, Any]:
-    """Return the metadata of a data set for LagrangeBench. ``split`` has run numbers by their use."""
+    """Return the metadata of a data set for LagrangeBench. ``split`` has the numbers of the runs for training,
+    validation and tests."""
     frames, (origin, size, periods) = table.steps // table.write_every + 1, bounds_of(scene)
     every = [folder.runs[number].statistics for own in split.values() for number in own]
     train = [folder.runs[number].statistics for number in split["train"]]

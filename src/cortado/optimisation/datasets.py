@@ -54,14 +54,14 @@ class DatasetTable(Table):
     """[dataset]: the number of steps, the variations and the stored arrays of the runs of a data set."""
 
     steps: Annotated[int, count(1, 10_000_000)]
-    """Time steps of each run."""
+    """Number of time steps of each run."""
     write_every: Annotated[int, count(1, 10_000_000)] = 1
-    """Time steps from one frame to the next; steps must be a multiple of this number."""
+    """Number of time steps from one frame to the next; steps must be a multiple of this number."""
     vary: Ranges = Field(default_factory=dict)
     """Ranges of values, by the key of a scene in quotes, as in vary."phase.0.viscosity" = [0.1, 1.0]. For each run,
     every component of a value is drawn independently."""
     logarithmic: tuple[Text, ...] = ()
-    """Keys of vary with a uniform distribution of the value's logarithm."""
+    """Keys of vary whose values have a log-uniform distribution."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0, le=0.5)] = 0.0
     """Standard deviation of the noise in every coordinate of the initial positions [spacings]"""
     velocity_noise: Annotated[float, quantity("m/s", ge=0.0)] = 0.0
@@ -75,7 +75,7 @@ class DatasetTable(Table):
     tangents: Annotated[int, count(0, 1_000)] = 0
     """Number of random directions of the initial state along which each run is differentiated."""
     tangent_frames: Literal["last", "all"] = "last"
-    """Frames with stored derivatives."""
+    """Frames with stored derivatives: only the last frame, or all frames."""
     seed: Annotated[int, count(0, 2**31)] = 0
     """Seed of all random numbers."""
 
@@ -97,7 +97,8 @@ class DatasetTable(Table):
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return the numbers of the runs for training, validation and tests. More runs do not change their use."""
+        """Return the numbers of the runs for training, validation and tests. Additional runs do not change the use of
+        earlier runs."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
@@ -112,7 +113,7 @@ class DatasetTables(Table):
 
 @dataclass(frozen=True)
 class Sample:
-    """Random values for a run of a data set. They depend only on the seed and the number of the run."""
+    """Random values for a run of a data set. The values depend only on the seed and the number of the run."""
 
     table: DatasetTable
     number: int
@@ -145,7 +146,8 @@ class Sample:
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Return a random direction of the initial state by name, with the standard deviations ``sizes`` [m, m/s]."""
+        """Return a random direction for derivatives with respect to the initial positions and velocities, by name.
+        ``sizes`` are the standard deviations [m, m/s]."""
         random = self._random(2, which)
         return {name: size * random.standard_normal(shape) for name, size in zip(FIRST, sizes, strict=True)}
 
@@ -155,9 +157,10 @@ class Sample:
 
 FIRST = ("initial_positions", "initial_velocities")
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
-"""Particle types of LagrangeBench, the type of further phases, and the number of types."""
+"""Particle types of LagrangeBench. ``MORE_FLUID`` is the type of further phases, and ``KINDS`` is the number
+of types."""
 MARGIN = 3
-"""Distance from the container to the bounds of the data set [spacings]. It separates opposite walls, because
+"""Distance from the container to the bounds of the data set [spacings]. The distance separates opposite walls, because
 LagrangeBench treats all axes as periodic if one axis is periodic."""
 
 
@@ -166,7 +169,7 @@ class OneRun:
     arrays: dict[str, np.ndarray]
     statistics: dict[str, Any]
     """Statistics of the run: count, sum and sum of squares of fluid velocities and accelerations [m per frame], the
-    upper ends of all positions [m], and the number of particles."""
+    greatest coordinates [m], and the number of particles."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
@@ -195,7 +198,8 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lower corner, the lengths and the periods (or 0) of the bounds of a data set, each (d,) [m].
+    """Return the lower corner, the lengths and the periods of the bounds of a data set, each (d,) [m]. The period of a
+    non-periodic axis is 0.
 
     Raises `InputError` without a container, or if particles wait far outside the container.
     """
@@ -228,8 +232,8 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
 
 
 def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics of first and second differences of positions (frames, n, d), and the upper ends of all
-    positions (d,) [m]. Raises `InputError` if a position is below the bounds."""
+    """Return statistics of first and second differences of positions (frames, n, d), and the greatest coordinates (d,)
+    [m]. Raises `InputError` if a position is below the bounds."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         found = f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis}"

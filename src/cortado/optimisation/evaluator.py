@@ -27,13 +27,13 @@ GREATEST_GRADIENT = 1e150
 REFUSED = (DivergedError, InputError)
 """Errors that give a trial point an infinite loss."""
 WRONG = 10.0
-"""Factor between predicted and real changes of the loss above which a gradient counts as wrong."""
+"""A gradient counts as wrong if predicted and real changes of the loss differ by more than this factor."""
 FELT = 0.01
-"""Greatest negligible change of the loss, relative to the range of all losses."""
+"""Changes of the loss below this fraction of the range of all losses are negligible."""
 ROUND_OFF = 1e-5
-"""Round-off of a float32 loss, relative to the greatest loss. Smaller predictions are not tested."""
+"""Round-off of a float32 loss, relative to the greatest loss. Smaller predicted changes are not tested."""
 MISLED, FEW = 0.25, 2
-"""Least fraction and least number of steps with wrong gradients in a misled search."""
+"""A search counts as misled from this fraction and this number of steps with wrong gradients."""
 LEAST = 8
 
 
@@ -60,9 +60,10 @@ class Record:
     replayed: bool
     """True if the evaluation comes from the checkpoint."""
     refused: int = 0
-    """Number of refused steps before. A step is refused if its run diverges or its parameters are out of range."""
+    """Number of refused steps before this evaluation. A step is refused if its run diverges or its parameters are out
+    of range."""
     left_out: int = 0
-    """Number of failed runs that ensemble averages ignored so far, without replayed evaluations."""
+    """Number of failed runs that ensemble averages ignored so far. Replayed evaluations are not counted."""
 
     def __repr__(self) -> str:
         return f"Record(iteration {self.iteration}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g})"
@@ -72,8 +73,9 @@ class Record:
 class Promises:
     """A test of a search's gradients, which compares predicted and real changes of the loss between evaluations.
 
-    The change of a smooth loss is close to the predictions from the slopes at the two ends of a step, or between them.
-    Steps with a change of sign of the slope are not tested, because they may cross a minimum.
+    The slopes at the two ends of a step give two predictions. If the loss is smooth, its real change is close to a
+    prediction or between the two. Steps with a change of sign of the slope are not tested, because they may cross a
+    minimum.
     """
 
     losses: list[float] = field(default_factory=list)
@@ -96,8 +98,9 @@ class Promises:
     def doubt(
         self, search: Search, estimator: object, optimiser: object, converged: bool, is_run: bool
     ) -> tuple[bool, bool, str]:
-        """Return whether a search was misled, whether its loss stopped falling though no bound holds it, and sentences
-        with advice. ``estimator`` is None for the problem's gradient. ``is_run`` is True for a loss of a simulation."""
+        """Return whether a search was misled, and whether its loss stopped falling although no parameter is at a bound.
+        The third result is a text with advice. ``estimator`` is None for the problem's own gradient. ``is_run`` is True
+        for a loss of a simulation."""
         assert self._best is not None
         x, gradient = self._best.parameters, self._best.gradient
         outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
@@ -138,7 +141,8 @@ class Promises:
 
 @dataclass
 class Evaluator:
-    """The objective function of the optimiser. It replays logged evaluations, and then computes and logs new ones."""
+    """The objective function of the optimiser. The evaluator first replays logged evaluations, and then computes and
+    logs new ones."""
 
     problem: Optimisable
     estimator: Any
@@ -156,7 +160,8 @@ class Evaluator:
     """Number of failed runs that ensemble averages ignored."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the ensemble's estimate, and count the runs that it leaves out. Only the first gives a warning."""
+        """Return the estimate of an ensemble, and count the runs missing from its average. Only the first such estimate
+        gives a warning."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -175,7 +180,7 @@ class Evaluator:
         return found
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return the loss and its gradient at a vector, or None for a failed run, logged with an infinite loss."""
+        """Return the loss and its gradient at a vector. For a failed run, return None and log an infinite loss."""
         return self._next(vector, is_trial=True)
 
     def _next(self, vector: Vector, is_trial: bool) -> tuple[float, Vector] | None:
@@ -246,7 +251,8 @@ class Evaluator:
         raise InputError(f"{said}, and its gradient, a dictionary with an array for each parameter by its name.")
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return a logged evaluation, ``ahead`` places after the next one. Raises `InputError` for another vector."""
+        """Return the logged evaluation ``ahead`` positions after the next one. Raises `InputError` if the logged vector
+        differs."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():

@@ -34,7 +34,7 @@ LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
 """A function that maps parameters by name to the loss and its gradient by name."""
 Bounds = Mapping[str, tuple[Any, Any]]
 MOST_ITERATIONS = 10_000_000
-"""Greatest number of updates of a search."""
+"""Greatest number of updates that a search may have."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,11 @@ class Result:
     converged: bool
     """True if the optimiser's convergence test was met and `misled` is false. Only L-BFGS has a convergence test."""
     refused: int = 0
-    """Number of refused steps, whose run diverged or whose parameters were out of range, not in the history."""
+    """Number of steps that were refused because the run diverged or a parameter was out of range. The history does not
+    contain refused steps."""
     left_out: int = 0
-    """Number of runs that averages over ensembles left out, as for `refused`. Runs of the checkpoint do not count."""
+    """Number of runs that were left out of averages over ensembles, for the same reasons as in `refused`. Runs that
+    were replayed from the checkpoint are not counted."""
     misled: bool = False
     """True if the gradient disagreed with the change of the loss. Do not trust the search then; `message` gives advice.
     Gradients are often wrong beyond the horizon of `cortado.certify`."""
@@ -126,7 +128,8 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 
 
 def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, Vector]]:
-    """Return lower and upper bounds by name, infinite if missing. Raises `InputError` for bounds that do not fit."""
+    """Return lower and upper bounds by name. Missing bounds are infinite. Raises `InputError` for bounds that do not
+    match the parameters."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
     if unknown := sorted(set(bounds) - set(start), key=str):
@@ -227,9 +230,10 @@ def optimise(
     Args:
         problem: a `Problem`, any object with `value_and_gradient`, or a function. The function takes parameters by name
             and returns the loss and its gradient, ``{"gravity": array of the parameter's shape}``.
-        start: first parameters by name, numbers or arrays of any shape. They are optimised together in float64.
-        optimiser: an object such as `cortado.optimisers.Adam(learning_rate=0.1)`, or "adam", "gradient_descent",
-            "lbfgs" or "line_search" with settings as keywords.
+        start: first parameters by name, numbers or arrays of any shape. All parameters are optimised
+            together in float64.
+        optimiser: an object such as `cortado.optimisers.Adam(learning_rate=0.1)`, or one of
+            the names "adam", "gradient_descent", "lbfgs" and "line_search", with settings as keywords.
         iterations: greatest number of updates. Adam and gradient descent also evaluate the last iterate.
         bounds: lower and upper bound of each parameter by name. A bound is a number, an array in the shape of the
             parameter, or None.
@@ -237,8 +241,8 @@ def optimise(
         checkpoint: folder of the replay log. Every evaluation is written to it before the next one begins.
         resume: continue the run in ``checkpoint``, or begin a new run in an empty folder. A resumed run gives exactly
             the numbers of a run without interruption. The number of ``iterations`` may change.
-        on_iteration: function that is called with the `Record` of every evaluation. This includes evaluations that are
-            read from the checkpoint, but not the trials of `LineSearch`.
+        on_iteration: function that is called with the `Record` of every evaluation. The function is
+            also called for evaluations from the checkpoint, but not for the trials of `LineSearch`.
         settings: settings of a named optimiser, as in
             ``optimise(problem, start, "adam", learning_rate=0.1, iterations=50)``.
 

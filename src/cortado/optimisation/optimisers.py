@@ -55,8 +55,8 @@ class Iterate:
         self.loss, self.gradient = search.evaluate(search.start)
 
     def move(self, target: Vector) -> float:
-        """Move to a vector (size,). If the run there fails, the step is halved until a run succeeds. Return the
-        fraction of the step that was taken, or raise the error of the shortest step."""
+        """Move to the point ``target`` (size,). If the run at this point fails, the step is halved until a run
+        succeeds. Return the remaining fraction of the step. If all runs fail, raise the error of the last run."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)
@@ -78,7 +78,8 @@ class Adam:
 
     A step changes a component by at most about the learning rate, for gradients of any size. Every update ends with a
     projection onto the bounds. If the run after a step diverges, Adam halves the step and the learning rate, at most 10
-    times, and restarts both means from 0. Adam has no convergence test and makes all iterations.
+    times. Adam then also resets the means of the gradient and of the squared gradient to 0. Adam has no convergence
+    test and makes all iterations.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1. Raises
     InputError for settings out of range.
@@ -129,12 +130,12 @@ class GradientDescent:
     """Gradient descent with a heavy ball: x_{k+1} = P(x_k - learning_rate g_k + momentum (x_k - x_{k-1})).
 
     x_k are the parameters after k updates, g_k is the gradient at x_k, and P projects onto the bounds. If the run after
-    a step diverges, the step and the learning rate are halved, at most 10 times, and the momentum term restarts from 0.
+    a step diverges, the step and the learning rate are halved, at most 10 times, and the momentum term is reset to 0.
     The method has no convergence test and makes all iterations.
 
     Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR Computational
-    Mathematics and Mathematical Physics 4(5), 1964. With momentum 0 it is plain gradient descent. Raises InputError for
-    settings out of range.
+    Mathematics and Mathematical Physics 4(5), 1964. With momentum 0 the method is plain gradient descent. Raises
+    InputError for settings out of range.
 
     ``learning_rate`` is a number, or one number for each parameter by name [unit of the parameter^2 / unit of the
     loss]. ``momentum`` is the factor of the previous step, in [0, 1) [-].
@@ -271,20 +272,21 @@ def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vect
 
 @dataclass(frozen=True)
 class LineSearch:
-    """Gradient descent whose step is the best of several trial lengths.
+    """Gradient descent that tries steps of several lengths and takes the step with the lowest loss.
 
     Use `LineSearch` for rough losses, and for gradients with the right direction but a wrong size, as in long runs. The
-    search steps over local minima that are narrower than its trials. It never steps to a point whose run diverges or
-    whose parameters are out of range. A trial is a run without a gradient, and all trials of an update form one batch.
+    search steps over local minima that are narrower than its trials. The search never steps to a point at which the run
+    diverges or a parameter is out of range. A trial is a run without a gradient, and all trials of an update form one
+    batch.
 
-    Update k moves the parameters x_k along a direction d_k. With the gradient g_k times the scale, and with unit(a) = a
-    divided by its root mean square,
+    Update k moves the parameters x_k along a direction d_k. The vector g_k is the gradient times the scale. The
+    function unit(a) divides a vector a by its root mean square:
 
         d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
 
-    over lengths s at even ratios from ``shortest`` to 1. P projects onto the bounds. The reach r_k is 1 at first, and
-    later 3 times the best length, at most 1. If no trial lowers the loss, the update still takes the best trial and
-    sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one.
+    over lengths s from ``shortest`` to 1 in a geometric sequence. P projects onto the bounds. The reach r_k is 1 at
+    first, and later 3 times the best length, at most 1. If no trial lowers the loss, the update still takes the best
+    trial and sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one.
 
     If every trial diverges, the parameters stay, the momentum is set to 0, and the reach is multiplied by ``shortest``.
     If the gradient at the best trial diverges, the step and the reach are shortened. The method has no convergence test

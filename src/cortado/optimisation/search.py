@@ -26,7 +26,7 @@ FORMAT = "cortado replay log 1"
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """The order and shapes of named parameters in the optimiser's vector. The shape of a number is ()."""
+    """The order and shapes of named parameters in the optimiser's vector. The shape of a scalar parameter is ()."""
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
@@ -44,7 +44,7 @@ class ParameterLayout:
         return np.concatenate(parts)
 
     def unravel(self, vector: Vector) -> dict[str, Vector]:
-        """Return copies of the parameters in a vector (size,), by name. Numbers become arrays of shape ()."""
+        """Return copies of the parameters in a vector (size,), by name. Scalar parameters become arrays of shape ()."""
         parts = np.split(vector, np.cumsum(self.sizes)[:-1])
         each = zip(self.names, self.shapes, parts, strict=True)
         return {name: part.reshape(shape).copy() for name, shape, part in each}
@@ -57,7 +57,7 @@ class ParameterLayout:
 
 @dataclass(frozen=True, eq=False)
 class LoggedEvaluation:
-    """An entry of a replay log: the loss and its gradient (size,) at parameters (size,)."""
+    """One evaluation in a replay log: the loss and its gradient (size,) at parameters (size,)."""
 
     parameters: Vector
     loss: float
@@ -143,8 +143,8 @@ class ReplayLog:
         self._file.close()
 
     def _begun(self, header: Mapping[str, Any]) -> tuple[int, int]:
-        """Return the place of the first record and the number of complete records. Raises `InputError` if the first
-        line differs from ``header``, or if a record before the last one is damaged."""
+        """Return the offset of the first record in the file [bytes], and the number of complete records. Raises
+        `InputError` if the first line differs from ``header``, or if a record before the last one is damaged."""
         try:
             found = parsed_json(self._file.readline(2**20))  # a damaged file may have no line end
         except ValueError:
@@ -187,15 +187,16 @@ class Search:
     attempt: Callable[[Vector], tuple[float, Vector] | None]
     """Function that maps a vector (size,) to the loss and the gradient (size,), or to None for a failed run."""
     losses: Callable[[Sequence[Vector]], list[float]]
-    """Function that maps several vectors (size,) to their losses, infinite for failed runs, without gradients."""
+    """Function that maps several vectors (size,) to their losses, without gradients. The loss of a failed run is
+    infinite."""
     layout: ParameterLayout
     """Order and shapes of the parameters in the vector."""
     start: Vector
     """First vector (size,), within the bounds."""
     lower: Vector
-    """Lower bounds (size,), -inf without a bound."""
+    """Lower bounds (size,). A missing bound is -inf."""
     upper: Vector
-    """Upper bounds (size,), +inf without a bound."""
+    """Upper bounds (size,). A missing bound is +inf."""
     iterations: int
     updated: Callable[[], None] = lambda: None
     """Function that the optimiser calls after each update."""

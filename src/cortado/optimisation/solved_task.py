@@ -41,7 +41,7 @@ MOST_CURVES = 12
 TITLES = ("first guess", "found", "target")
 IMAGES = 6
 EVALUATIONS = (1, 5, 20, 100)
-"""Numbers of the evaluations that are shown. The start has number 0."""
+"""Numbers of the evaluations for which pictures are shown. The start has number 0."""
 Run = Mapping[int, Snapshot]
 
 
@@ -143,7 +143,7 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
 
 
 def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
-    """Return names of the components of a parameter: axes, phases, or numbers."""
+    """Return names for the components of a parameter: axes, phases, or consecutive numbers."""
     scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")

@@ -32,7 +32,8 @@ GIVEN = Words("given")
 
 @dataclass(frozen=True)
 class Task:
-    """An inverse problem, with a scene, a target, and a search. Parameters over time are stored for each time step."""
+    """A scene with a target and a search for the parameters that reach this target. Parameters over time have one value
+    for each time step."""
 
     scene: Scene
     problem: ProblemTable
@@ -79,7 +80,8 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
 
 
 def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Table]) -> tuple[Known, Any]:
-    """Return the parameters of the scene, and the tables of a task, which must match the scene. Raises `SceneError`."""
+    """Return the parameters of the scene and the checked tables of a task. Raises `SceneError` if the tables do not
+    match the scene."""
     try:
         known = known_in(scene)
         names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
@@ -93,7 +95,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Check values by parameter name, and interpolate values over time to all time steps. Raises `SceneError`."""
+    """Check values by parameter name, and interpolate parameters over time to all time steps. Raises `SceneError`."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]
@@ -242,14 +244,14 @@ class Setup:
     task: Task
     problem: Problem
     searches: tuple[Transformed, ...]
-    """Searches, one for each entry of the extinction schedule."""
+    """Successive searches, one for each factor in the extinction schedule."""
     start: Arrays
     bounds: dict[str, tuple[Any, Any]]
     """Bounds of the coordinates, by parameter name."""
     renderer: Renderer | None
     """Renderer of the compared pictures, or None if positions are compared."""
     targets: dict[int, np.ndarray]
-    """Target images (rows, columns, 3) or positions (n, d) [m] by number of steps."""
+    """Target images (rows, columns, 3) or target positions (n, d) [m], by step number."""
 
     @property
     def search(self) -> Transformed:

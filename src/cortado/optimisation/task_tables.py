@@ -33,8 +33,8 @@ ESTIMATORS: dict[str, AdjointEstimator] = {"exact": Exact(), "adjoint_viscosity"
 
 
 def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Convert values to arrays by parameter name. Values of parameters in `CAN_BE_RANDOM` may also be one of
-    ``words``."""
+    """Convert values to arrays by parameter name. Parameters in `CAN_BE_RANDOM` may instead have one of the ``words``
+    as their value."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
     names, flat = _names(info), dict[str, Any]()
@@ -87,11 +87,11 @@ def _schema(words: tuple[str, ...] = ()) -> dict[str, Any]:
 
 VALUES = _schema()
 Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(VALUES)]
-"""Parameters by name. Each is a number, a list of numbers, or a list of lists of numbers."""
+"""Parameter values by name. A value is a number, a list of numbers, or a list of lists of numbers."""
 Start = Annotated[
     dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
 ]
-"""`Values` that may be the word "random" for first positions and mass fractions."""
+"""Parameter values by name. First positions and mass fractions may be the word "random"."""
 ParameterName = Annotated[str, OneOf(NAMES), WrapValidator(_known)]
 
 
@@ -103,7 +103,7 @@ class MeasuredTable(Table):
     file: Text
     """File with the measured data, relative to the folder of the task's file."""
     start: Seconds = 0.0
-    """Time of the run at time 0 of the file."""
+    """Time of the simulation at the time 0 of the file."""
 
 
 class VideoTable(MeasuredTable):
@@ -116,19 +116,19 @@ class VideoTable(MeasuredTable):
     every: Annotated[int, count(1, 1_000_000)] = 1
     """Use only every n-th frame."""
     crop: Annotated[tuple[Pixel, ...], components("left", "top", "right", "bottom")] | None = None
-    """Compared rectangle of each frame, in pixels of the frame; by default the whole frame."""
+    """Part of each frame that is compared, as a rectangle in pixels; by default the whole frame."""
     mask: Text | None = None
     """Picture whose black pixels are ignored, in the size of the frames. Its path is relative to the folder of the
     task's file."""
     calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
-    """Quantities that are fitted in addition: parameters of the camera, the extinction of the fluid, or "start" for the
-    time in the key start."""
+    """Quantities that are also fitted: parameters of the camera, the extinction of the fluid, or "start" for the start
+    time of the file."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
     """Standard deviation of the linear light of a pixel; by default it is estimated from the residuals."""
 
 
 class SensorSeriesTable(MeasuredTable):
-    """Readings of a sensor in a CSV file with a column "time" [s] and a column for each number of the sensor. Columns
+    """Readings of a sensor in a CSV file with a column "time" [s] and a column for each quantity of the sensor. Columns
     may be named as in `sensors.csv`, such as "gauge.height [m]". Columns of other sensors are ignored."""
 
     kind: Literal["sensor"]
@@ -136,19 +136,19 @@ class SensorSeriesTable(MeasuredTable):
     sensor: Text
     """Name of the [[sensor]] in the scene."""
     calibrate: Clock = ()
-    """["start"] to fit the time in the key start too."""
+    """["start"] to fit the start time of the file too."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
     """Standard deviation of a reading, in its unit; by default it is estimated from the residuals."""
 
 
 class TracksTable(MeasuredTable):
-    """Paths of tracers in a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. Every
-    tracer needs a line at the start of the run."""
+    """Paths of tracers in a CSV file with columns "time" [s], "tracer" (a number), "x", "y" and in 3-D "z" [m]. The
+    file must contain the position of every tracer at the start of the run."""
 
     kind: Literal["tracks"]
     """The measurements are paths of tracers, which move with the fluid."""
     calibrate: Clock = ()
-    """["start"] to fit the time in the key start too."""
+    """["start"] to fit the start time of the file too."""
     noise: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Standard deviation of a coordinate [m]; by default it is estimated from the residuals."""
 
@@ -157,7 +157,7 @@ AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(disc
 
 
 def _growing(value: Any, check: Callable[[Any], Any]) -> tuple[float, ...]:
-    """Return the factors of a continuation schedule. Raises a `field_error` unless they increase to 1."""
+    """Return the factors of a continuation schedule. Raises a `field_error` if the factors do not increase to 1."""
     with suppress(ValueError):
         factors = check(value)
         if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
@@ -174,17 +174,17 @@ class ProblemTable(Table):
     parameters."""
 
     steps: Annotated[int, count(0, 10_000_000)]
-    """Number of time steps; 0 for a loss of the first state."""
+    """Number of time steps; 0 to compute the loss of the initial state."""
     loss: Literal["positions", "image"] = "positions"
-    """What is compared with the target: positions of particles or images."""
+    """Data that are compared with the target: positions of particles, or images."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
-    """Distance between images: the squared difference, or an image pyramid for shapes that do not overlap at
+    """Distance between images: the squared difference, or an image pyramid, which suits shapes that do not overlap at
     the start."""
     frames: Annotated[int, count(1, 10_000)] = 1
-    """Number of compared states, evenly spaced up to the last state."""
+    """Number of states that are compared with the target, evenly spaced in time up to the last state."""
     target: Values | None = None
-    """True parameters by name. The target is the result of a run with these parameters. Either target or picture is
-    needed."""
+    """True parameters by name. The target is the result of a run with these parameters. Give either target or
+    picture."""
     picture: Text | None = None
     """"heart", "rosetta", or a picture file, relative to the folder of the task's file."""
     measured: tuple[AnyMeasured, ...] = ()
@@ -247,14 +247,15 @@ class GradientTable(Table):
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """Name of the estimator. "adjoint_viscosity" suits long splashes."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
-    """Coefficient C of `AdjointViscosity`, whose strength is C times the strain in a step; by default 2."""
+    """Coefficient C of `AdjointViscosity`; by default 2. The strength of the viscosity is C times the strain
+    in a step."""
     samples: Annotated[int, count(1, 10_000)] = 1
     """Number of runs over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
-    """Width of the ensemble for every searched parameter by name, in the units of its knots or logarithms. Several
-    samples need this key. Samples may be out of bounds; search positive parameters by their logarithm."""
+    """Width of the ensemble for every searched parameter by name, in the units of its knots or logarithms. This key is
+    needed with several samples. Samples may be out of bounds, so search positive parameters by their logarithm."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
-    """Standard deviation by which first positions are perturbed in the ensemble."""
+    """Standard deviation of the random displacements of first positions in the ensemble."""
 
     @model_validator(mode="before")
     @classmethod
@@ -307,15 +308,15 @@ class OptimiseTable(Table):
     """Lower and upper bound by parameter name. Viscosity, mobility and fractions never become negative, with or without
     bounds."""
     extinction_schedule: Schedule = (1.0,)
-    """Factors of successive searches. Each search multiplies the scene's extinction by one factor, and starts at the
-    end of the previous search. Pictures of thinner fluid show more of the fluid behind its surface."""
+    """Factors of successive searches. Each search multiplies the scene's extinction by one factor, and starts from the
+    result of the previous search. With less extinction, pictures show more of the fluid behind its surface."""
     optimiser: Annotated[str, OneOf(BY_NAME)] = "adam"
     """Name of the algorithm. The line search of "lbfgs" needs exact gradients."""
     learning_rate: Annotated[float, quantity("units of the parameters", gt=0.0)]
     """Approximate step size of Adam, first step size of L-BFGS, or greatest step size of the line search, in units of
-    the parameters. For gradient descent it is the factor of the gradient."""
+    the parameters. For gradient descent, the learning rate is the factor of the gradient."""
     tolerance: Annotated[float, quantity(gt=0.0, le=0.5)] | None = None
-    """L-BFGS ends when the gradient is smaller than this fraction of the first gradient. By default it ends when
+    """L-BFGS ends when the gradient is smaller than this fraction of the first gradient. By default L-BFGS ends when
     round-off errors prevent further progress."""
     iterations: Annotated[int, count(1, MOST_ITERATIONS)]
     """Greatest number of updates of each search."""
@@ -351,16 +352,16 @@ class FitTable(Table):
     start: Values
     """First values of the fitted parameters by name. Positive parameters are searched by their logarithm."""
     bounds: Values | None = None
-    """Lower and upper bound by parameter name. A number with equal bounds is kept fixed."""
+    """Lower and upper bound by parameter name. A value with equal bounds is not fitted."""
     iterations: Annotated[int, count(1, 10_000)] = 50
     """Greatest number of trial points of each of the two fits. The first fit gives all residuals equal weights. The
     second fit uses weights from the noise that the first fit found."""
     starts: Annotated[int, count(1, 100)] | None = None
-    """Number of starts of the fit. By default it is 1, with three more if the result of the first fit is doubtful.
-    Further starts lie within the bounds, or within two decades of a positive number."""
+    """Number of starts of the fit. By default the fit has one start, and three more if its result is doubtful. Further
+    starts lie within the bounds. Without bounds, positive parameters vary by a factor of up to 100."""
     profiles: Annotated[int, count(0, 100)] = 7
-    """Number of points in the profile of each fitted number; 0 for no profiles. At each point all other numbers are
-    fitted."""
+    """Number of points in the profile of the sum of squares for each fitted value; 0 for no profiles. At each point of
+    a profile, all other values are fitted again."""
 
 
 class FitTables(Table):

@@ -75,7 +75,8 @@ class Softmax:
 
 @dataclass(frozen=True)
 class TimeInterpolation:
-    """Linear interpolation of values p (steps, d) between values u (k, d) at knots, which are evenly spaced in time."""
+    """Linear interpolation in time. Values u (k, d) at evenly spaced knots give values p (steps, d) at all
+    time steps."""
 
     steps: int
     knots: int
@@ -86,7 +87,7 @@ class TimeInterpolation:
 
     @property
     def places(self) -> np.ndarray:
-        """Return the times of the knots (k,) in time steps, counted from 0."""
+        """Return the times (k,) of the knots, measured in time steps from the start."""
         return np.linspace(0.0, self.steps - 1.0, self.knots)
 
     @property
@@ -111,14 +112,15 @@ class Affine:
     """The transform p = base + matrix u, for example for accelerations of a tank with a fixed end position."""
 
     def __init__(self, base: Any, matrix: Any):
-        """Store ``base``, in the shape and unit of the parameter, and ``matrix`` with ``base.shape + u.shape``."""
+        """Store the transform. ``base`` has the shape and unit of the parameter, and ``matrix`` has the shape
+        ``base.shape + u.shape``."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
 
     def __repr__(self) -> str:
-        """Return a text with a checksum of the numbers."""
+        """Return a text with a checksum of ``base`` and ``matrix``."""
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
@@ -206,7 +208,8 @@ class Transformed(OtherParameters):
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Estimate the loss and the gradient at coordinates u. Ensembles have spreads in units of the coordinates."""
+        """Estimate the loss and the gradient at coordinates u. The spread of an ensemble is in units of the
+        coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
@@ -252,7 +255,8 @@ class FixedParameters(OtherParameters):
     """A problem with some parameters fixed, as a function of the remaining parameters."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
-        """Store a problem and ``fixed`` parameters by name. They must include ``initial_positions`` (n, d) [m]."""
+        """Store a problem and ``fixed`` parameters by name. The fixed parameters must include ``initial_positions`` (n,
+        d) [m]."""
         self.problem, self._fixed, of = problem, fixed, problem.simulation
         self.simulation = SimpleNamespace(
             batch=None, scene=of.scene, positions=fixed["initial_positions"], precision=of.precision, known=of.known

@@ -9,7 +9,8 @@ adjoints of the position and of the value of particle i are
 
 These derivatives are exact, but slower than handwritten derivatives.
 
-Call a made derivative only from a kernel. If a `wp.func` calls it, its C++ code does not compile.
+Call such a derivative only from a Warp kernel. If a `wp.func` calls the derivative, the generated C++ code does not
+compile.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,8 +28,7 @@ TermMaker = Callable[[Discretisation], Callable[..., Any]]
 
 def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
     """Make the Warp function ``f(i, *arrays, *bars, *others, s)`` of the adjoint of a sum over neighbours. ``bars`` are
-    the adjoints of the sums. The function returns the adjoints of particle i's entry of each array, and of ``others``.
-    """
+    the adjoints of the sums. The function returns the adjoints of the element i of each array, and of ``others``."""
     term = _differentiable(make, d)
     bars, results = bars_of(term), (*term.arrays.values(), *term.others.values())
 
@@ -50,7 +50,8 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
 
 
 def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """Make the Warp function of the tangent of a sum over neighbours. Each argument is followed by its tangent."""
+    """Make the Warp function of the tangent of a sum over neighbours. In the arguments of this function, each input of
+    the sum is followed by its tangent."""
     term = _differentiable(make, d)
     arrays, others = (
         {each: kind for name, kind in types.items() for each in (name, f"{name}_dot")}
@@ -97,7 +98,7 @@ def _made(
 
 
 def work_of(term: Term, precision: Precision, module: Any) -> Any:
-    """Make the Warp function of the scalar product of the results of a term and their adjoints."""
+    """Make the Warp function that multiplies the results of a term by their adjoints and adds up the products."""
     types, bars = {**term.parameters, **bars_of(term)}, bars_of(term)
     products = (
         f"_term_{n} * {bar}" if kind is precision.real else f"_wp.{dot_of(kind)}(_term_{n}, {bar})"

@@ -2,13 +2,16 @@
 
 The mirror image of a particle at x is at R x + o. The matrix R and the vector o define a reflection at a flat wall, or
 at two or three adjacent sides of the container. Bits in the number of a reflection mark sides of the container: 1, 2, 4
-at the lower ends of the axes, and 8, 16, 32 at the upper ends. Numbers from `FACES` on are flat faces of moving solids.
+at the lower ends of the axes, and 8, 16, 32 at the upper ends. Reflections at flat faces of moving solids have numbers
+from `FACES` on.
 
-In lists of neighbours the image of particle j has the number ``reflections j + reflection``. A wall mirrors only
-particles in front of it.
+In lists of neighbours, an image of particle j has the number ``reflections j + reflection``. Here ``reflection`` is the
+number of the reflection, and ``reflections`` is the count of all reflections. A wall mirrors only particles in front of
+it.
 
 If a solid moves, the velocity of an image also depends on the displacement of the mirror in the time step, which is
-called ``swept``. Tangents and adjoints of images include the pose of the solid (`MovingWalls`).
+called ``swept``. Tangents and adjoints of images include derivatives with respect to the pose of the solid
+(`MovingWalls`).
 """
 
 from typing import Any
@@ -19,11 +22,12 @@ from cortado.device.modules import by_name
 from cortado.device.precision import Precision
 
 FACES, MOST_FACES = 64, 64
-"""Number of the first face of a moving solid, and greatest number of faces."""
+"""Reflection number of the first flat face of the moving solids, and greatest number of such faces."""
 NUMBERS = 2**31
 CONTAINER = -1
 NOTHING = ALL_WALLS = -NUMBERS
-"""Values in place of the number of a solid: for no solid, and for all walls."""
+"""Special value in place of the number of a solid. Depending on the name, the value stands for no solid or for all
+walls."""
 
 
 def reflections(moving: bool) -> int:

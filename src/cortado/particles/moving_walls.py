@@ -30,17 +30,19 @@ class WallArrays(Rows):
     positions: np.ndarray
     """Positions (b, 3) [m]. Positions on moving solids are in the frame of the solid."""
     weights: np.ndarray
-    """Weights in the density (b,) [-], where a fluid particle has the weight 1."""
+    """Weights (b,) of wall particles in the density [-]. The weight of a fluid particle is 1."""
     grips: np.ndarray
-    """Weights of walls without slip (b,) [-], 0 for walls with free slip."""
+    """Weights (b,) of wall particles in sums of friction [-]. The weight is 0 for walls with free slip."""
     feet: np.ndarray
-    """Vectors to the nearest point on the surface (b, 3) [m]."""
+    """Vectors (b, 3) from wall particles to the nearest point on the surface [m]."""
     slides: np.ndarray
     """Velocities with which the surface slides along the solid (b, 3) [m/s]."""
     solid: np.ndarray
-    """Number of the solid (b,): 0, 1, ... if it moves, -2, -3, ... if it rests, and -1 for the container."""
+    """Number (b,) of the solid: 0, 1, ... for moving solids, -2, -3, ... for solids at rest, and -1 for the
+    container."""
     faces: np.ndarray
-    """Number of the mirroring flat face in front of the wall particle (b,), or -1."""
+    """Number (b,) of the flat face that mirrors the fluid in front of the wall particle. Without such a face the number
+    is -1."""
 
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
@@ -175,7 +177,8 @@ class MovingWalls:
     """The wall particles of moving solids."""
 
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
-        """Take the ``walls`` of ``solids`` moving solids, numbered from ``first`` on in the neighbour search."""
+        """Store the ``walls`` of moving solids. ``solids`` is the number of moving solids, and ``first`` is the index
+        of the first wall particle in the arrays of the neighbour search."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
         self.sizes = sizes_type(precision)()

@@ -78,7 +78,8 @@ class Discretisation:
     periodic: bool = False
     moving: bool = False
     taped: bool = False
-    """True if a Warp tape differentiates the forward kernels. They then need a single thread per particle."""
+    """True if a Warp tape differentiates the forward kernels. Forward kernels then need a single thread per
+    particle."""
 
     @property
     def types(self) -> tuple[Any, Any, Any]:
@@ -114,7 +115,7 @@ class Discretisation:
 
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
-    """Make the Warp struct of a neighbourhood. Its arrays are sorted by cell."""
+    """Make the Warp struct of a neighbourhood. The arrays of a neighbourhood are sorted by cell."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Neighbourhood:
@@ -126,12 +127,13 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Lists [neighbour, particle] of fluid neighbours, then wall neighbours, then images. Lists of fluid neighbours
         are padded with the particle itself."""
         fluid_count: wp.array(dtype=wp.int32)
-        """Length of the padded list of fluid neighbours."""
+        """Length (n,) of the padded list of fluid neighbours of each particle."""
         filling: wp.array(dtype=wp.int32)
         count: wp.array(dtype=wp.int32)
         all_count: wp.array(dtype=wp.int32)
         wall_positions: wp.array(dtype=vector)
-        """Positions of wall particles [m]. `cortado.particles.moving_walls.WallArrays` describes their other arrays."""
+        """Positions of wall particles [m]. `cortado.particles.moving_walls.WallArrays` describes the other arrays of
+        wall particles."""
         wall_weights: wp.array(dtype=real)
         wall_grips: wp.array(dtype=real)
         wall_velocities: wp.array(dtype=vector)
@@ -142,9 +144,9 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Tangents of the positions of wall particles."""
         wall_velocities_dot: wp.array(dtype=vector)
         wall_turns_dot: wp.array(dtype=vector)
-        """Tangents of the rotations of solids at wall particles, as rotation vectors."""
+        """Tangents of the rotations of the solids to which wall particles belong, as rotation vectors."""
         wall_growths_dot: wp.array(dtype=real)
-        """Relative tangents of the weights of wall particles [-]."""
+        """Tangents of the weights of wall particles, divided by the weights [-]."""
         support: real
         """Support radius h [m]."""
         per_support: real
@@ -156,7 +158,8 @@ def neighbourhood_type(precision: Precision) -> Any:
         self_weight: real
         """Smoothing kernel at distance 0 [1 / m^d]."""
         response_scale: real
-        """Inverse root of the sum of squared kernel gradients in a filled neighbourhood [m^(d + 1)]."""
+        """Inverse square root of the sum of squared kernel gradients over all neighbours of a particle inside the fluid
+        [m^(d + 1)]."""
         laplacian_correction: real
         """Correction factor of second derivatives [-]. See `cortado.discretise.smoothing`."""
         volume: real
@@ -169,19 +172,19 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Coordinates of mirroring walls at the lower ends of the axes [m], or -inf."""
         mirror_upper: vector
         faces: wp.int32
-        """Number of mirroring flat faces of moving solids."""
+        """Number of flat faces of moving solids that mirror the fluid."""
         face_solids: wp.array(dtype=wp.int32)
         face_places: wp.array(dtype=vector)
         """Middles of the faces in the frames of their solids [m]."""
         face_frames: wp.array(dtype=matrix)
-        """Matrix for each face, in the frame of its solid. The rows are the normal towards the fluid and two unit
-        vectors along the face."""
+        """Matrix for each face, in the frame of its solid. The rows of the matrix are the normal towards the fluid and
+        two unit vectors along the face."""
         face_sizes: wp.array(dtype=vector)
         """Vector (0, a, b) for each face, where a and b are half the lengths of the face along its two unit vectors
         [m]."""
         wall_faces: wp.array(dtype=wp.int32)
         after: wp.array2d(dtype=vector)
-        """Middles of solids after the time step (members, solids) [m]."""
+        """Positions of the middles of solids after the time step (members, solids) [m]."""
         turns: wp.array2d(dtype=matrix)
         before: wp.array2d(dtype=vector)
         turns_before: wp.array2d(dtype=matrix)

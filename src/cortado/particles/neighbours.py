@@ -57,7 +57,7 @@ def scan_types(discretisation: Discretisation) -> TypesByName:
 @cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
     """Make the Warp function that appends the neighbours among the particles from ``first`` to ``last`` - 1, except
-    ``own``. It uses one thread per particle."""
+    ``own``. The function uses one thread per particle."""
     pair = pair_functions(discretisation)
     separation, load = pair.separation, pair.load_vector
 
@@ -221,7 +221,8 @@ def fill_kernel(discretisation: Discretisation) -> Any:
 
     @typed.kernel(discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
-        """List neighbours, and write the greatest lengths to ``needed``, even if they exceed the capacity."""
+        """Write the lists of neighbours. The greatest length of a list is written to ``needed``, even if it exceeds the
+        capacity."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:

@@ -1,4 +1,5 @@
-"""Sums over neighbours, each made of the term of a pair of particles: a function whose parameter names are its inputs.
+"""Sums over neighbours. A sum is made from a function that computes the term of one pair of particles. The parameter
+names of this function are the inputs of the term.
 
     @pair_sum(discretisation)
     def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
@@ -7,22 +8,22 @@
 is the Warp function ``force(i, x, c, s)`` of particle i, the arrays x and c, and the neighbourhood s. Parameters are
 
     x_ij               the separation x_i - x_j of the nearest image
-    c_i, c_j, v_ij     an array's entry of the particle, of its neighbour, and v_i - v_j
+    c_i, c_j, v_ij     an array's value at the particle, its value at the neighbour, and v_i - v_j
     i, j               the numbers of the particles; j is -1 for a wall particle
     foot               for walls: the vector from a wall particle to the nearest point of the surface
-    mirrored           for works of walls: 1 if the wall mirrors about particle i, otherwise 0
+    mirrored           for walls: 1 if the wall mirrors about particle i, otherwise 0
     turn_dot           for tangents of terms of walls: the tangent of the rotation of the wall's solid
     swept, swept_dot   for images by moving solids: the displacement of the mirror in a step, and its tangent
     direct, direct_dot for images: the separation from the mirrored particle, and its tangent
     s                  the neighbourhood
-    any other          a value for all neighbours of a particle, which stands between the arrays and s
+    any other          a value that is equal for all neighbours; its argument is between the arrays and s
 
-A term with several values makes several sums in one loop. For a wall particle every value with index j is 0, unless
-walls have a separate term, and the term is multiplied by the weight of the wall particle. Names of parameters must not
-begin with an underscore.
+A term that returns several values makes several sums in one loop. The term of a wall particle is multiplied by the
+weight of the wall particle. If walls have no separate term, every value with index j is 0 for a wall particle. Names of
+parameters must not begin with an underscore.
 
-With ``ahead=False`` the values of a neighbour are loaded just before its term is computed. Loading them earlier is
-quicker if terms are cheap.
+With ``ahead=False`` the values of a neighbour are loaded just before its term is computed. With ``ahead=True`` the
+values are loaded earlier, which is quicker for cheap terms.
 
 Derivatives of sums are handwritten (`tangent_of`, `adjoint_of`) where derivatives by Warp
 (`cortado.particles.made_derivatives`) would slow down a step. Tests compare all derivatives in `BY_HAND` with Warp's.
@@ -54,8 +55,8 @@ class Term:
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """Read the term of a function, whose parameters need annotations. Raises `TypeError` for missing annotations
-        and for names that begin with an underscore."""
+        """Make a term from a function with annotated parameters. Raises `TypeError` for missing annotations and for
+        names that begin with an underscore."""
         types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
         for name in names:
             if name not in types or isinstance(types[name], str):
@@ -85,7 +86,8 @@ class Term:
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j", back: bool = False) -> str:
-        """Return the arguments of the term for particle i and its neighbour, or, ``back``, for the neighbour and i."""
+        """Return the source text of the term's arguments for particle i and its neighbour. If ``back`` is true, the
+        roles of the two particles are exchanged."""
         known = {"x_ij": "_x_ij", "i": "i", "j": j, **OF_WALLS, **OF_IMAGES}
         if back:
             known = {"x_ij": "-_x_ij", "i": "_j", "j": "i"}
@@ -108,7 +110,8 @@ def own_entry(array: str) -> str:
 
 
 def between(parameter: str, own: str, other: str) -> str:
-    """Return the text of a parameter, given the texts of the array's entries of the particle and its neighbour."""
+    """Return the source text for a parameter. ``own`` is the text for the array's value at the particle, and ``other``
+    is the text for its value at the neighbour."""
     texts = {"i": own, "j": other, "ij": f"{own} - {other}"}
     return texts[parameter.rpartition("_")[2]] if array_of(parameter) else parameter
 
@@ -153,9 +156,9 @@ Loops = Callable[[Term, Term], str]
 def over_fluid(
     term: Term, d: Discretisation, ahead: bool, arrays: Types | None = None, body: Body | None = None
 ) -> str:
-    """Return the text of a loop over fluid neighbours that reads ``arrays``. By default it adds up the term.
+    """Return the text of a loop over fluid neighbours that reads ``arrays``. By default the loop adds up the term.
 
-    ``ahead`` loads the entries of `UNROLL` neighbours before using any of them.
+    If ``ahead`` is true, the loop loads the values of `UNROLL` neighbours before it uses any of these values.
     """
     arrays, body = arrays or term.of_neighbours, body or _adding_up(term)
     kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
@@ -305,7 +308,8 @@ def image_sum(d: Discretisation, typed: Typed = None) -> Decorator:
 
 
 def image_sum_of_solid(total: Any) -> Any:
-    """Return the part of a sum over images that comes from the walls of ``solid``, an argument before s."""
+    """Make the Warp function of a sum over the images by the walls of one solid. ``total`` is the sum over all images.
+    The number ``solid`` is an additional argument before s."""
     d, body = total.discretisation, _adding_up(total.term, f"{OWNED} * ")
     others, loop = {**total.others, "solid": int}, over_images(d, total.arrays, body)
     scope = {"_term": wp.func(total.term.function, module=total.module)}
@@ -313,7 +317,8 @@ def image_sum_of_solid(total: Any) -> Any:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """Return a decorator factory for sums with friction, over walls without slip too if fluid ``sticks`` to walls."""
+    """Return a function that makes decorators for sums with friction. If fluid ``sticks`` to walls, the sums include
+    walls without slip."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, None, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, None, ahead)
@@ -322,7 +327,8 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 
 def wall_sum(d: Discretisation, typed: Typed = None, grows: Any = None, weight: str = ALL) -> Decorator:
-    """Return a decorator that turns a term into its sum over wall particles, with the source text of the weight."""
+    """Return a decorator that turns a term into its sum over wall particles. ``weight`` is the source text for the
+    weight of a wall particle."""
     return _summing(d, typed, lambda _, wall: over_walls(wall, d, grows, weight), grows=grows)
 
 

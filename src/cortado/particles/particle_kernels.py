@@ -7,19 +7,19 @@
 is a kernel that sums ``spread`` over the neighbours of particle i, with m as the array w, and writes the function's
 result to c_new[i].
 
-Parameters are results of sums, entries c_i of arrays c, the particle's number ``i``, its scene's number ``member``, the
-neighbourhood ``s``, and numbers and whole arrays of a launch. All others, such as ``time_step``, are entries of the
-particle's scene. A result "+x_bar" is added to the entry of the array. A result "acceleration:acceleration_in" is
-written as the sum of the result and the entry of acceleration_in.
+Parameters are results of sums, values c_i of arrays c, the particle's number ``i``, its scene's number ``member``, the
+neighbourhood ``s``, and numbers and whole arrays that are passed to the launch. Any other parameter, such as
+``time_step``, is an array with one value for each scene. A result "+x_bar" is added to x_bar[i]. A result
+"acceleration:acceleration_in" is added to acceleration_in[i], and the sum is written to acceleration[i].
 
-`sum_kernels` makes the kernels of a multiple of a sum. `pointwise_kernels` lets Warp differentiate a function r =
+`sum_kernels` makes kernels that compute a multiple of a sum. `pointwise_kernels` lets Warp differentiate a function r =
 f(x_i, ..., time_step, ...) of a particle's values:
 
     tangent:  r_dot[i] = df/dx x_dot[i] + ... + df/dtime_step time_step_dot[scene]
     adjoint:  x_bar[i] += (df/dx)^T r_bar[i],   time_step_bar[i] += df/dtime_step . r_bar[i]
 
-Particles store their terms of the adjoint of a scene's parameter, which are summed later. The tangent of a rotation R
-is the vector w with R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
+For the adjoint of a scene's parameter, each particle stores a contribution. These contributions are summed later. The
+tangent of a rotation R is the vector w with R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
 
 Warp has two traps. After ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, whereas ``a =
 array[j]`` makes a copy. ``wp.grad`` does not compile in a function that the kernel's function calls.
@@ -248,15 +248,16 @@ class Kinds:
     """Inputs with adjoints that the adjoint kernel overwrites."""
     known: Names = ()
     where: str = ""
-    """Name of an array that selects particles. Tangents of results are 0 where its entry is 0."""
+    """Name of an array with one value for each particle. Tangents of results are 0 for particles with the value 0."""
     told: Names = ()
-    """Inputs with a column for each time step."""
+    """Input arrays with one column for each time step."""
     summed: Names = ()
     """Results that are summed over the particles of each scene."""
     turned: Mapping[str, str] = field(default_factory=dict)
     """Names of rotation matrices, with the names of their tangents, which are rotation vectors."""
     read: Mapping[str, str] = field(default_factory=dict)
-    """Parameters for values of a table (`cortado.sph.formula`), with their source texts in a kernel."""
+    """Parameters that a kernel reads from a table (`cortado.sph.formula`), with the source text that reads the
+    value."""
 
 
 class _Pointwise:

@@ -1,15 +1,15 @@
 """Sheets, which are walls without thickness. Particles on opposite sides of a sheet do not interact.
 
-Lists of neighbours are first made without sheets. Once in each time step these hidden neighbours of particle i are
-removed:
+Lists of neighbours are first made without sheets. Once in each time step, the following hidden neighbours of particle i
+are removed:
 
 - particle j, if the segment from i to j crosses a sheet;
-- the image of j, if the segment to it, or from the image of i to j, crosses a sheet;
-- a wall particle of a sheet, unless the segment to it crosses this sheet and no other sheet;
-- a wall particle of a solid or the container, if the segment to it crosses a sheet.
+- the image of j, if the segment from i to the image of j, or from the image of i to j, crosses a sheet;
+- a wall particle of a sheet, if the segment from i to it crosses another sheet or does not cross this sheet;
+- a wall particle of a solid or the container, if the segment from i to it crosses a sheet.
 
 The wall particles of a sheet fill the hidden part of the support, also at tips and holes. Positions of particles and
-sheets are the positions before the time step. A particle ends a time step on the side where it begins
+sheets are the positions before the time step. A particle does not change the side of a sheet in a time step
 (`cortado.solvers.projection.sides`).
 
 Lists of fluid neighbours are symmetric, because the tested segment of a pair always starts at the particle with the
@@ -49,7 +49,8 @@ def sheets_type(precision: Precision) -> Any:
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions: ``scale_of`` a sheet, and ``seen_from``, which takes a position to a sheet's frame."""
+    """Make two Warp functions. ``scale_of`` returns the scale of a sheet, and ``seen_from`` converts a position to the
+    frame of a sheet."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
     turnings = wp.array2d(dtype=precision.matrix)

@@ -34,12 +34,12 @@ class StateField:
 
     name: str
     unit: str
-    """SI unit, or an empty text for a plain number."""
+    """SI unit, or an empty text for a dimensionless field."""
     entry: Entry
     axis: Axis = Axis.PARTICLE
-    """PARTICLE for one entry per particle, in the order of the scene, or SCALAR for a single entry."""
+    """PARTICLE for one value per particle, in the order of the scene, or SCALAR for a single value."""
     first: str | None = None
-    """Name of the parameter with the first value, or None for a field that begins at 0."""
+    """Name of the parameter that contains the first value. None for a field that is 0 at the start."""
     is_constant: bool = False
     """True if no time step changes the field."""
 
@@ -50,7 +50,8 @@ class StateField:
 
 
 def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
-    """Raise `TypeError` if two fields have the same name, or if a parameter does not fit as a first value."""
+    """Raise `TypeError` if two fields have the same name, or if the parameter with a first value does not match its
+    field."""
     names: set[str] = set()
     for field in fields:
         if field.name in names:
@@ -99,7 +100,7 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return a view of an array of numbers, vectors or matrices as numbers in a given shape."""
+    """Return a view of an array of scalars, vectors or matrices as an array of scalars with the given shape."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -170,7 +171,8 @@ class State(Arrays):
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
-        """Take the arrays of declared fields. ``batch`` is the number of scenes, or None for a single scene."""
+        """Make a state from the arrays of declared fields. ``batch`` is the number of scenes, or None for a single
+        scene."""
         super().__init__(arrays)
         self.fields, self.batch = fields, batch
         self._narrow: dict[int, dict[str, Any]] = {}
@@ -192,7 +194,7 @@ class State(Arrays):
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make a later state of this run with uninitialised arrays. It shares the arrays of constant fields."""
+        """Make a later state of this run with uninitialised arrays. Both states share the arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
@@ -293,8 +295,8 @@ class Parameters(Arrays):
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write parameters by name, for all members or with a first axis for the members. A value is a vector (d,) or
-        vectors (steps, d), a number or an array of numbers, or a Warp array.
+        """Write parameters by name. A value is equal for all members, or has a first axis for the members. Values may
+        be vectors (d,) or (steps, d), numbers, arrays of numbers, or Warp arrays.
 
         Only `set`, `set_row` and kernels that take `to_write` may write to these arrays.
         """
@@ -326,12 +328,12 @@ class Parameters(Arrays):
         return self._numbers[name]
 
     def to_write(self, name: str) -> wp.array:
-        """Return `numbers` for a kernel that writes all of them."""
+        """Return the view `numbers` of a parameter for a kernel that writes all elements of the view."""
         self._written[name] = self[name]
         return self.numbers(name)
 
     def _on_host(self, name: str) -> np.ndarray:
-        """Return an array for the numbers of a parameter, which on a CPU has its memory. Third components are 0."""
+        """Return a host array for the values of a parameter. On a CPU, the array shares memory with the parameter."""
         if name not in self._tables:
             array = self[name]
             shape = (*array.shape, *getattr(array.dtype, "_shape_", ()))
@@ -375,7 +377,7 @@ class Layout:
         return sum_of(dtype, self.particles, self.device, self.members)
 
     def arrays(self, suffix: str = "", requires_grad: bool = False, **kinds: Any) -> dict[str, wp.array]:
-        """Make arrays of zeros with an entry for each particle. ``kinds`` are Warp types by name, and ``suffix`` is
+        """Make arrays of zeros with an element for each particle. ``kinds`` are Warp types by name, and ``suffix`` is
         added to the names."""
         sizes = {f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}
         return zeros(sizes, self.device, requires_grad)

@@ -1,5 +1,5 @@
-"""The effect of the walls of one solid, or of all walls, on each particle by one term of a step. Its derivatives
-include derivatives with respect to the pose and size of moving solids.
+"""One term of a time step that acts on each particle from the walls of one solid or from all walls. The derivatives of
+the term include derivatives with respect to the pose and size of moving solids.
 
 A term is defined by its work W, a number that is linear in a vector ``bar`` of particle i. The sum over wall particles
 b, such as the acceleration by walls, is
@@ -7,15 +7,15 @@ b, such as the acceleration by walls, is
     A_i = sum_b w_b dW / dbar_i.
 
 Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
-``bar``. The adjoint is the gradient of W for the adjoint of A as ``bar``. With that adjoint particle i adds to the
-adjoints of wall particle b
+``bar``. The adjoint is the gradient of W for the adjoint of A as ``bar``. With this vector ``bar``, particle i adds to
+the adjoints of wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b.
 
 The nearest point on the surface is s_b = c + R q_b, with the middle c and the rotation R of the solid, and the wall
 particle is at x_b = s_b - foot_b. R has also rotated the vector foot_b. The velocity of the wall particle is (s_b -
-s_b^0) / dt + R u, with s_b^0 = c_0 + R_0 q_b at the start of the step. A scale sigma multiplies q_b by sigma, and w_b
-by sigma^(d - 1).
+s_b^0) / dt + R u, where u is the velocity of the surface along the solid. At the start of the step the nearest point is
+s_b^0 = c_0 + R_0 q_b. A scale sigma multiplies q_b by sigma, and w_b by sigma^(d - 1).
 
 Let a solid move by c', turn further by w' and grow by g' = sigma' / sigma, and let its pose at the start of the step
 change by c_0' and w_0'. The work is f^T c' + t^T w' + f_0^T c_0' + t_0^T w_0' + g g' with
@@ -109,7 +109,8 @@ class _Loop:
 
 @dataclass(frozen=True)
 class WallTerm:
-    """A term of the forces by walls. ``make(discretisation)`` returns the function of its work."""
+    """A term of the forces by walls. ``make(discretisation)`` returns the function that computes the work of
+    the term."""
 
     discretisation: Discretisation
     topic: str
@@ -125,7 +126,7 @@ class WallTerm:
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
-        """Return the kernel of the adjoints of a moving solid."""
+        """Return the kernel that computes the adjoints of a moving solid's pose and scale."""
         return solid_kernel(self.discretisation, self.topic, self.make, self.rubs)
 
 
@@ -220,7 +221,7 @@ class SolidShares:
         return found
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
-        """Add values (members,) to the adjoints of a solid. The names are in `BARS`."""
+        """Add values (members,) to the adjoints of a solid. The names of the values are in `BARS`."""
         for bar, one in given.items():
             add(one, self._whole[solid][bar])
 
@@ -243,7 +244,8 @@ def solid_kernel(
 ) -> Any:
     """Make the kernel of one sum for `SolidShares.add`. ``topic`` names its Warp module.
 
-    ``make(discretisation)`` returns the work of a term of walls. It may call only functions with derivatives in Warp.
+    ``make(discretisation)`` returns the function that computes the work of a wall term. The function may call only
+    functions that Warp can differentiate.
     """
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))

@@ -44,7 +44,8 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 def _write_series(run: Exported, folder: Path, advance: Advance, ending: str, text: Callable[[Any], Any]) -> list[str]:
-    """Write the files of all frames, with the contents ``text``. Return the entries of a ParaView collection."""
+    """Write one file for each frame. The function ``text`` makes the contents of a file. Return the entries of a
+    ParaView collection."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
         files: dict[str, Any] = {"particles": (_numbered("particles", number, ending), frame)}

@@ -41,8 +41,8 @@ MOST_SHIFT = 1.0
 
 @dataclass(frozen=True)
 class WholeFrames:
-    """Evenly spaced frames of an animation. Frame k is at the time start + k / rate. Its particles are extrapolated
-    from a recorded state to this time."""
+    """Evenly spaced frames of an animation. Frame k is at the time start + k / rate. The particles of a frame are
+    extrapolated from a recorded state to the time of the frame."""
 
     rate: float
     """Frame rate [1/s]."""
@@ -57,8 +57,9 @@ class WholeFrames:
 
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
-        """Choose frames for states recorded at ``times`` (m,) [s]. Frames are at the ``marks``, or at the states if the
-        states are evenly spaced. Otherwise a round frame rate is chosen that gives each state a frame, or the mean."""
+        """Choose frames for states recorded at ``times`` (m,) [s]. With ``marks``, the frames are at the marks. Without
+        marks, the frames are at the states if the states are evenly spaced in time. Otherwise the frame rate is a round
+        number that gives each state a frame. If no round number does, the frame rate is the mean rate of the states."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -139,7 +140,7 @@ class ExportedFrame:
 
 
 class Exported:
-    """A run and its scene in the form for export. Raises `InputError` if colours cannot be computed."""
+    """The data of a run and its scene for export. Raises `InputError` if colours cannot be computed."""
 
     def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Computed = None):
         self.times, self.scene = trajectory.times, scene
@@ -152,10 +153,12 @@ class Exported:
             self.solids.append(_solid(one, part, name in trajectory.solids))
         self._trajectory = trajectory
         self.up = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(3)
-        """Rotation (3, 3) of the upward direction of the scene, against gravity, to the y axis."""
+        """Rotation matrix (3, 3) that turns the upward direction of the scene to the y axis. The upward direction is
+        opposite to gravity."""
         self.spacing = scene.discretisation.spacing
         self._held = (0.0, 0.0, 1.0, 1.0)
-        """Greatest relative difference of volumes so far, its time [s], and the volumes of surface and fluid [m³]."""
+        """Greatest relative difference so far between the volumes of surface and fluid, the time of this difference
+        [s], and both volumes [m³]."""
 
     @cached_property
     def whole(self) -> WholeFrames:
@@ -163,11 +166,12 @@ class Exported:
 
     @property
     def series(self) -> WholeFrames | None:
-        """Frames of a series of files, or None if all recorded states are written."""
+        """Return the evenly spaced frames of a series of files, or None if all recorded states are written."""
         return None if self._trajectory.marks is None else self.whole
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """Yield all recorded states or the ``whole`` frames, one at a time to save memory."""
+        """Yield the evenly spaced frames ``whole``, or by default all recorded states. Yield them one at a time to save
+        memory."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
         solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
@@ -240,7 +244,7 @@ def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
 
 
 def enclosed(points: Points, triangles: np.ndarray) -> float:
-    """Return the volume [m³] inside triangles (t, 3) of points (p, 3) [m]."""
+    """Return the volume [m³] that is enclosed by triangles (t, 3) with corners ``points`` (p, 3) [m]."""
     a, b, c = (points[corner] - points[0] for corner in triangles.T)
     return float(_sixth(a, b, c).sum())
 
@@ -248,7 +252,8 @@ def enclosed(points: Points, triangles: np.ndarray) -> float:
 def with_volume(
     points: Points, triangles: Numbers, ways: Points, places: Points, spacing: float, kept: Callable[[Points], Points]
 ) -> Points:
-    """Move the points (p, 3) [m] of a surface so that it encloses the volume of its particles, ``spacing``³ each.
+    """Move the points (p, 3) [m] of a surface until the surface encloses the volume of the particles. The volume of one
+    particle is ``spacing``³.
 
     ``ways`` (p, 3) are outward unit vectors or 0, and ``places`` (n, 3) [m] are positions of particles. ``kept`` moves
     points beyond a wall back to the wall.
@@ -277,7 +282,8 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number the connected bodies of fluid. Return the numbers of surface points (p,) and of particles (n,), or -1."""
+    """Number the connected bodies of fluid. Return the number of the body for each surface point (p,) and each particle
+    (n,). The number is -1 outside all bodies."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree

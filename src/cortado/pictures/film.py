@@ -42,8 +42,8 @@ Around = tuple[tuple[int, ...], tuple[int, ...]]
 """Numbers of the frames before and after a frame, the nearest first."""
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
-"""A function that draws frame number k as a linear picture (rows, columns, 3) from 0 to 1. Its second argument is the
-frames before and after k."""
+"""A function that draws frame number k as a linear picture (rows, columns, 3) from 0 to 1. The second argument has the
+numbers of the frames before and after k."""
 LEAST_PIXELS = 64
 SLOW = 0.1
 """Speed of a film below which fluid at rest is not averaged over frames [simulated seconds per second]."""
@@ -61,7 +61,7 @@ class Page:
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
     def images(self, frames: Sequence[int], begin: int = 0, window: int = WINDOW) -> Iterator[Points]:
-        """Yield the pictures of a film's frames from ``begin`` on. A thread draws the next picture meanwhile."""
+        """Yield the pictures of a film's frames from ``begin`` on. A thread draws the next picture in advance."""
         shown, count = range(begin, len(frames)), len(self.panels)
         drawn = _ahead(count, (panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels))
         return (self.composed(list(islice(drawn, count))) for _ in shown)
@@ -259,7 +259,8 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Computed = None) -> NDArray | None:
-    """Return the values (frames, n) for the colours of particles, or None for the colours of phases.
+    """Return the values (frames, n) that determine the colours of particles. Return None if particles have the colours
+    of their phases.
 
     Raises:
         InputError: the quantity was not recorded and cannot be computed.

@@ -103,7 +103,8 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 
 def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
-    """Resample the largest central part of a Pillow picture with the ratio of ``resolution``, in linear light."""
+    """Resample the largest central part of a Pillow picture that has the aspect ratio of ``resolution``, in linear
+    light."""
     from PIL import Image
 
     if resolution == picture.size:
@@ -145,7 +146,8 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Warn, with a sentence that begins with ``found``, if ``size`` must be cropped to the ratio of ``shape``."""
+    """Warn if a picture of ``size`` must be cropped to the aspect ratio of ``shape``. The warning begins with the text
+    ``found``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < 0.99:
@@ -197,7 +199,7 @@ def _drawn(shape: Shape, resolution: Resolution, cup: float | None, size: float,
 
 
 def _coverage(shape: Shape, columns: int, rows: int) -> Picture:
-    """Return the fraction of each pixel inside a shape (rows, columns, 1)."""
+    """Return the fraction (rows, columns, 1) of each pixel that is inside the shape."""
     half, samples = 0.5 * min(columns, rows), 6  # along the side of a pixel
     covered = np.zeros((rows, columns, 1))
     offsets = (np.arange(samples) + 0.5) / samples
@@ -258,8 +260,8 @@ def read_frames(
     frame_rate: float | None = None,
     every: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read frames (frames, rows, columns, 3) in linear light from 0 to 1, and their times (frames,) [s] since the first
-    frame. Return the times and the frames.
+    """Read frames of a video, and return their times and pictures. Times (frames,) [s] begin at the first frame.
+    Pictures (frames, rows, columns, 3) are linear light from 0 to 1.
 
     Args:
         path: a video, or a folder of pictures, which are read in the order of their names.

@@ -199,7 +199,8 @@ def film_page(film: Film) -> str:
 
 
 def result_page(found: object, message: str, problem: Any, start: Values, best: Values, losses: Any) -> str:
-    """Return HTML of the result of a search. For a `Problem`, it shows the runs with the first and best parameters."""
+    """Return HTML of the result of a search. For a `Problem`, the page shows the runs with the first and best
+    parameters."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None

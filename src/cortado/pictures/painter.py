@@ -1,4 +1,4 @@
-"""Painters of scenes, texts and lines on pictures, colour scales, and the picture of a scene before a run."""
+"""Draw scenes, texts, lines and colour scales on pictures, and draw the picture of a scene before a run."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from cortado.scene.scene import Scene
 
 FINER = 3
 Text = tuple[tuple[int, int], str, str]
-"""A text on a picture: its place (column, row), the text, and Pillow's two-letter anchor."""
+"""A text on a picture: the position (column, row), the text, and Pillow's two-letter anchor."""
 INK = from_srgb(np.array([43, 42, 40], dtype=np.uint8))
 PALETTE = "viridis"
 UNITS = {"age": "s", **{name: quantity.unit for name, quantity in QUANTITIES.items()}}
@@ -41,12 +41,14 @@ def painter(
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the stage for fluid at positions (n, d) or (frames, n, d) [m], and for the solids at later ``poses``."""
+    """Return the surroundings of the fluid at positions (n, d) or (frames, n, d) [m]. Solids are also shown at later
+    ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Return the linear colour of each particle (n, 3), mixed from ``colours`` (phases, 3), by default the scene's."""
+    """Return the linear colour (n, 3) of each particle, mixed from the colours (phases, 3) of its phases. By default
+    the colours of phases are those of the scene."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
@@ -195,7 +197,8 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """Make the scale for ``values``, such as all of a film. Give the ``unit`` of a quantity of some scenes only."""
+        """Make the colour scale for ``values``, such as all values in a film. Give the ``unit`` if only some scenes
+        have the quantity."""
         least, greatest = np.percentile(values, (0.5, 99.5))
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 

@@ -1,4 +1,5 @@
-"""An animation of particles as a part of an HTML page. It plays from a file, without a server or a network."""
+"""An animation of particles as a part of an HTML page. The animation plays from a file, without a server or a
+network."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ def style() -> str:
 
 
 def script() -> str:
-    """Return the script that runs all animations of a page. It must appear once, after the animations."""
+    """Return the script that runs all animations of a page. The script must appear once in the page, after the
+    animations."""
     source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
     return f"<script>\n{source}</script>"
 
@@ -130,7 +132,7 @@ def _base64(array: NDArray[Any]) -> str:
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
-    """Return HTML that shows runs of a scene side by side, given by name their states at ``times`` (frames,) [s]."""
+    """Return HTML that shows runs of a scene side by side. ``runs`` maps names to states at ``times`` (frames,) [s]."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)

@@ -21,13 +21,14 @@ LIGHT = (-0.45, 0.70, 0.55)
 BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
 """Softness, downward offset and greatest distance of shadows, relative to the size of the contents."""
 Layer = tuple[Points, Points]
-"""Opacity (rows, columns, 1) and colours (rows, columns, 3) of a layer."""
+"""Opacity (rows, columns, 1) and colours (rows, columns, 3) of one layer of a picture."""
 SUPPORT = 1.3
-"""Support radius of a particle's field [spacings]."""
+"""Distance from a particle at which its contribution to the drawn fluid vanishes [spacings]."""
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """Shade a shape so that it looks thicker in the middle than at its edge, and return colours (rows, columns, 3).
+    """Return the colours (rows, columns, 3) of a shape with glossy shading, so that its middle looks thicker than its
+    edge.
 
     Args:
         cover: fraction of each pixel that the shape covers (rows, columns).
@@ -54,19 +55,19 @@ def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) 
 
 @dataclass(frozen=True)
 class PlaneStage:
-    """The surroundings of 2-D fluid on the pixels of a picture."""
+    """Everything in a 2-D picture except the fluid: paper, container and solids."""
 
     picture: Picture
     container: BoxContainer | None
     lower: Points
-    """Lower corner of the contents (2,) [m]."""
+    """Lower corner (2,) [m] of the container, or of the fluid and the solids if there is no container."""
     upper: Points
-    """Upper corner of the contents (2,) [m]."""
+    """Upper corner (2,) [m] of the container, or of the fluid and the solids if there is no container."""
     spacing: float
     """Particle spacing [m]."""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
-    """Lower and upper corner (2,) [m] of the shown region, by default of the contents."""
+    """Lower and upper corner (2,) [m] of the shown region. The default is the region from `lower` to `upper`."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
@@ -106,14 +107,14 @@ class PlaneStage:
 
     @cached_property
     def pixels(self) -> tuple[Points, Points]:
-        """Coordinates x and y of the middle of each pixel (rows, columns) [m]."""
+        """Coordinates x and y [m] of the centre of each pixel, two arrays (rows, columns)."""
         columns, rows, middle = self.picture.width, self.picture.height, self.middle
         x = middle[0] + (np.arange(columns) - 0.5 * (columns - 1)) * self.pixel
         y = middle[1] - (np.arange(rows) - 0.5 * (rows - 1)) * self.pixel
         return np.meshgrid(x, y)
 
     def on_screen(self, points: Points) -> Points:
-        """Return the column and row in the picture (n, 2) of points (n, 2) [m]."""
+        """Convert points (n, 2) [m] to pixel coordinates (n, 2): column and row in the picture."""
         off = (points - self.middle) / self.pixel
         return np.stack([0.5 * self.picture.width + off[:, 0], 0.5 * self.picture.height - off[:, 1]], axis=1)
 
@@ -125,7 +126,8 @@ class PlaneStage:
 
     @cached_property
     def behind(self) -> Points:
-        """Draw the background of the fluid (rows, columns, 3): paper with shadows, and the inside of the container."""
+        """Colours (rows, columns, 3) of the picture behind the fluid: paper with shadows, and the inside of the
+        container."""
         (x, y), middle, half = self.pixels, self.middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
         paper = np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
@@ -218,7 +220,6 @@ class PlaneStage:
         return float((self.upper - self.lower).max())
 
     def _below(self, shown: ShownSolid) -> Points:
-        """Return the darkening of the paper by the shadow of a solid (rows, columns)."""
         distance = self._distance(shown, DROPPED * self._size)
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
 
@@ -299,7 +300,7 @@ class PlanePainter:
 
 
 def _weight(distances: Points, reach: float) -> Points:
-    """Return Wendland's C2 function of distances / reach, which is 1 at distance 0."""
+    """Return Wendland's C2 function, which falls from 1 at distance 0 to 0 at the distance ``reach``."""
     q = np.minimum(distances / reach, 1.0)
     return (1.0 - q) ** 4 * (1.0 + 4.0 * q)
 

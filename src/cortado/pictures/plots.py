@@ -32,7 +32,8 @@ STYLE: dict[str, Any] = {
 
 @contextmanager
 def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
-    """Yield a figure with a width and height in inches. It is saved at `path` if the block ends without an error."""
+    """Create a figure with a ``width`` and ``height`` in inches, for use in a ``with`` block. The figure is saved at
+    ``path`` if the block ends without an error."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -55,7 +56,8 @@ def whole_numbers(axis: Any) -> None:
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
-    """Plot losses (evaluations,) over the evaluations, on a logarithmic scale if any loss is positive."""
+    """Plot losses (evaluations,) against the number of the evaluation. The axis of losses is logarithmic if any loss is
+    positive."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
     logarithmic = bool(np.any(values[shown] > 0.0))
@@ -89,7 +91,8 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot each component of ``found`` (k, c) over ``x`` (k,) in a panel. ``true`` and ``start`` are (c,) or (k, c)."""
+    """Plot each component of ``found`` (k, c) against ``x`` (k,) in its own panel. The curves ``true`` and ``start``
+    are constants (c,) or arrays (k, c)."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
     with drawing(path, height=1.6 + 1.9 * count) as figure:
@@ -111,7 +114,7 @@ def panels(
 
 
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path) -> Path:
-    """Plot linear images (rows, columns, 3) in a row. More than four images form a grid."""
+    """Plot images with linear colours (rows, columns, 3) side by side. More than four images form a grid."""
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
         raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
@@ -147,11 +150,12 @@ def particles(
 
     Args:
         positions: one array (n, d) [m] for each panel.
-        colours: for each panel (n,) numbers, which share one colour scale, or (n, 3) linear colours from 0 to 1. None
-            shades particles by depth.
+        colours: for each panel, linear colours (n, 3) from 0 to 1, or numbers (n,) on a colour scale. All panels share
+            the colour scale. None shades particles by depth.
         colour_label: label of the colour scale, with its unit.
         container: lower and upper corner (d,) [m] of the container, whose outline is drawn.
-        lines: for each panel (k, 2, d) end points of lines [m], drawn over the particles, such as outlines of solids.
+        lines: for each panel, end points (k, 2, d) [m] of k lines, such as outlines of solids. The lines are drawn over
+            the particles.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
@@ -234,7 +238,8 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
 
 
 def spacing_of(points: NDArray[Any], otherwise: float = 0.02) -> float:
-    """Return the median distance to the nearest neighbour [m], or ``otherwise`` for a single particle."""
+    """Return the median distance between a point and its nearest neighbour [m]. For a single point, return
+    ``otherwise``."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:

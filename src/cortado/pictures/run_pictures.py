@@ -46,7 +46,7 @@ def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
     """Draw the first and the last state of a run, a contact sheet and a film into a folder. Return captions and paths.
-    Contact sheet and film have the quality "quick" unless the scene sets the quality."""
+    The contact sheet and the film have the quality "quick", unless the scene sets another quality."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -79,7 +79,7 @@ def run_page(run: ShownRun, device: Any) -> Page:
 
 
 def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | Stage, Callable[[Points], Points]]:
-    """Return a stage with space for a colour scale, and the function that draws the scale."""
+    """Return a stage with space for a colour scale, and a function that draws the colour scale into an image."""
     free = stage.picture.width - scale.columns(stage.picture.height)
     is_covered = stage.on_screen(corners(*stage.ends))[:, 0].max() > free
     if not is_covered or free < LEAST_PIXELS:
@@ -90,7 +90,8 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 def shown_run(
     trajectory: Trajectory, scene: Scene, settings: Settings, units: Any = None, simulation: Computed = None
 ) -> ShownRun:
-    """Return a run with replaced keys of [picture]. ``simulation`` computes colours that were not recorded."""
+    """Return a run for pictures. ``settings`` replace keys of the scene's table [picture], and ``simulation`` computes
+    quantities for colours that were not recorded."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units
@@ -167,8 +168,8 @@ def _units_of_fields(simulation: Simulation) -> dict[str, str]:
 
 
 def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> Scene:
-    """Return the scene with keys of [picture] replaced by ``settings``. ``colour`` may also name one of ``fields``.
-    Raises `SceneError` for invalid settings."""
+    """Return the scene with keys of its table [picture] replaced by ``settings``. The key ``colour`` may also name one
+    of the recorded ``fields``. Raises `SceneError` for invalid settings."""
     given = {} if scene.picture is None else scene.picture.model_dump()
     wanted = {**given, **settings}
     if "lines" in settings:
@@ -190,7 +191,8 @@ def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot density error [%] and iterations of each solver loop over time steps, and mark unconverged steps."""
+    """Plot the density error [%] and the iterations of each solver loop against the time step. Steps without
+    convergence are marked."""
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
@@ -219,7 +221,7 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
-    """Plot a curve for each number of each sensor, with one panel for each unit."""
+    """Plot the readings of sensors over time. Each number of a sensor has a curve, and each unit has a panel."""
     lines = dict[str, list[tuple[str, Readings, str]]]()
     for name, own in found.items():
         for column, unit in own.units.items():
@@ -233,7 +235,6 @@ def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
 
 @contextmanager
 def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
-    """Yield vertically stacked panels of a plot over time, one for each unit."""
     with drawing(path, height=1.5 + 2.5 * len(units)) as figure:
         panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
         yield panels
@@ -244,7 +245,7 @@ def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
-    """Plot a panel for each measured number, with the measured points, the curve of the sensor, and the error."""
+    """Plot a panel for each measured quantity: the measured points, the curve of the sensor, and the error."""
     with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")

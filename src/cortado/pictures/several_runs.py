@@ -43,12 +43,13 @@ def film_side_by_side(
     """Write a film of up to nine runs side by side, an mp4 or webp as in `Trajectory.film`, and return it.
 
     All runs share the clock, the camera, the colour scale and the table [picture] of the first scene. At each time of
-    the film, the recorded frame nearest in time is shown. A run that has ended shows its last frame.
+    the film, each run shows its recorded frame with the nearest time. A run that has ended shows its last frame.
 
     Args:
-        runs: trajectories by label. In a list without labels, labels are made of the values in which the scenes differ.
+        runs: trajectories by label, or a list of trajectories. The labels of a list are made of the values that differ
+            between the scenes.
         path: path that ends in .mp4 or in .webp.
-        scenes: the scenes of the runs or the paths of their files, needed for trajectories loaded from files.
+        scenes: scenes of the runs or paths of scene files, needed for trajectories loaded from files.
         device: device that traces the rays, "cpu" or "cuda:0".
         settings: as in `Trajectory.film`. ``lines``, ``width`` and ``height`` are the size of the whole film.
 
@@ -83,7 +84,8 @@ def film_side_by_side(
 
 
 def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
-    """Return the scenes with the first one's [picture]. Raises `InputError` for runs that do not fit together."""
+    """Return all scenes with the table [picture] of the first scene. Raises `InputError` for runs that do not fit
+    together, such as 2-D and 3-D runs."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -99,7 +101,8 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Return a page of runs, labelled with name and time, and its times [s]. `shown_alike` prepares the scenes."""
+    """Return a picture page of several runs, labelled with name and time, and the times of its frames [s]. Prepare the
+    scenes with `shown_alike`."""
     times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -131,7 +134,8 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] of a film of several runs, at the interval of the run with the most frames."""
+    """Return the times (frames,) [s] for a film of several runs. The time between frames is the interval of the run
+    with the most frames."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -150,7 +154,7 @@ def interval_of(times: NDArray[Any]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ShownFrames:
-    """The recorded frames of one run that are nearest to the times of a film."""
+    """The recorded frames of one run for a film. Each time of the film shows the nearest recorded frame."""
 
     own: NDArray[Any]
     """Times of the recorded frames [s]."""
@@ -163,12 +167,12 @@ class ShownFrames:
 
     @cached_property
     def during(self) -> NDArray[np.bool_]:
-        """Mask (frames,) of the times of the film at which the run is running."""
+        """Mask (frames,) of film times between the first and the last recorded frame."""
         near = SAME * interval_of(self.times)
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
     def time_in_words(self, k: int) -> str:
-        """Describe the recording time of frame k."""
+        """Describe the time of the recorded frame that frame ``k`` of the film shows."""
         interval = interval_of(self.times)
         digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
         time = f"{self.own[self.nearest[k]]:.{digits}f} s"
@@ -181,8 +185,11 @@ class ShownFrames:
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """Return a label for each scene. It is the scene's name if all names differ, or else the values in which the scenes
-    differ, such as ``viscosity = 0.1 Pa s``. Return ``otherwise`` if no values or too many values differ."""
+    """Return a label for each scene. The labels are the names of the scenes if all names differ.
+
+    Otherwise the labels are made of the values that differ between the scenes, such as ``viscosity = 0.1 Pa s``. Return
+    ``otherwise`` if no values or too many values differ.
+    """
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]

@@ -20,7 +20,8 @@ FAR = 1e9
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """Merge coincident vertices. Return vertices, triangles that still have an area, and a mask of these triangles."""
+    """Merge coincident vertices and remove triangles without area. Return the vertices, the remaining triangles, and a
+    mask of the remaining triangles."""
     whole = np.rint((vertices - vertices.min(axis=0)) / (1e-9 * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
@@ -34,7 +35,7 @@ def sides_of(corners: Numbers) -> Numbers:
 
 
 def across_of(vertices: Points, corners: Numbers) -> Points:
-    """Return the outward normals of triangles (t, 3). The length of a normal is twice the area of the triangle [m2]."""
+    """Return an outward normal of each triangle. The length of the normal is twice the triangle's area [m2]."""
     a, b, c = vertices[corners].transpose(1, 0, 2)
     return np.asarray(np.cross(b - a, c - a))
 
@@ -45,8 +46,8 @@ def unit(vectors: NDArray[Any]) -> Points:
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
-    """Return the cosine of the angle between a triangle and its neighbour at the side opposite to each corner (t, 3).
-    It is -1 for sides without exactly one neighbour."""
+    """Return cosines (t, 3) of the angles between the normals of adjacent triangles. Each side of a triangle has the
+    index of its opposite corner. The cosine is -1 for sides without exactly one adjacent triangle."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -58,7 +59,7 @@ def cosines_of(vertices: Points, corners: Numbers) -> Points:
 class ShownSolid:
     name: str
     shape: Solid
-    """Shape relative to the solid's middle, without rotation. The shape of a tank is its cavity."""
+    """Shape of the solid with its middle at the origin, without rotation. The shape of a tank is its cavity."""
     position: Points
     """Position of the solid's middle (d,) [m]."""
     turn: Points
@@ -81,16 +82,17 @@ class ShownSolid:
 
     @property
     def solid(self) -> Solid:
-        """Region that fluid cannot enter. For a tank it is the outside of the cavity."""
+        """Region that fluid cannot enter. For a tank, the region is the outside of its cavity."""
         return Hollow(self.body) if self.is_tank else self.body
 
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """Return the solid in coordinates with axes ``frame`` (d, d) and an ``origin`` (d,) [m]."""
+        """Convert the solid to coordinates with the rotation matrix ``frame`` (d, d) and the ``origin`` (d,) [m]."""
         return replace(self, position=frame @ (self.position - origin), turn=frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Return the solids of a scene, moved into the periodic box, with their periodic images in the container."""
+    """Return the solids of a scene, including periodic images. Solids outside the periodic box are moved into
+    the box."""
     found, domain = [], scene.domain
     for table in scene.solid:
         shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
@@ -120,19 +122,20 @@ def union(boxes: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
 
 
 def solid_outline(scene: Scene) -> Points:
-    """Return the outlines of the solids of a scene at rest as line segments (k, 2, d) [m]."""
+    """Return the outlines of all solids in a scene as line segments (k, 2, d) [m], with the solids at rest."""
     lines = [own_lines(one) @ one.turn.T + one.position for one in shown_solids(scene)]
     return np.concatenate([np.zeros((0, 2, scene.dimension)), *lines])
 
 
 def own_faces(shown: ShownSolid) -> Faces:
-    """Return the faces of a solid relative to its middle, without rotation."""
+    """Return the faces of a solid with its middle at the origin, without rotation."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
     return shown.shape.shown_faces(np.pi / 48 * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:
-    """Return the outline of a solid relative to its middle, without rotation, as line segments (k, 2, d) [m]."""
+    """Return the outline of a solid as line segments (k, 2, d) [m]. The solid's middle is at the origin, without
+    rotation."""
     faces = own_faces(shown)
     if len(shown.turn) == 2:
         return faces.vertices[faces.corners]
@@ -155,11 +158,12 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Cut triangles (t, 3) of vertices (v, 3) [m] into smaller triangles. Return vertices, triangles, and the number of
-    the original triangle for each new triangle.
+    """Cut triangles (t, 3) with vertices (v, 3) [m] into smaller triangles. Return the new vertices, the new triangles,
+    and the index of the original triangle for each new triangle.
 
-    Each side is cut into 2^k equal parts no longer than ``longest`` [m], with the least k, so that adjacent triangles
-    fit. New sides inside a triangle are at most longer by a factor of the square root of 2.
+    Each side is cut into equal parts no longer than ``longest`` [m]. The number of parts is the least possible power of
+    2, so adjacent triangles still share their vertices. New sides inside a triangle are at most sqrt(2) times as long
+    as ``longest``.
     """
 
     def parts_of(sides: Numbers) -> Numbers:
@@ -230,14 +234,14 @@ def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> 
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """A triangle mesh of solids in space. Seen from outside, the corners of a triangle run counterclockwise."""
+    """A triangle mesh of solids in 3-D. Seen from outside, the corners of a triangle run counterclockwise."""
 
     points: Points
-    """Points (p, 3) [m]."""
+    """Positions of the vertices (p, 3) [m]."""
     normals: Points
-    """Outward unit vectors (p, 3)."""
+    """Outward unit normals at the vertices (p, 3)."""
     triangles: Numbers
-    """Indices of the points of each triangle (t, 3)."""
+    """Indices of the vertices of each triangle (t, 3)."""
     from_edges: Points
     """Distance of each corner (column) from each side (row) of a triangle (t, 3, 3) [m], or `FAR` for smooth edges."""
 
@@ -259,7 +263,7 @@ class SolidMesh:
         return cls(places, whole, number.reshape(-1, 3), np.where(is_sharp, distances, FAR))
 
     def smoothed(self, values: Points) -> Points:
-        """Smooth values at points (p, c) along the surface, but not across sharp edges."""
+        """Smooth values (p, c) at the vertices along the surface, but not across sharp edges."""
         from scipy.sparse import csr_matrix
 
         ends = self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The surroundings of fluid in a 3-D picture: the up direction, the floor, the container, the lamps and the camera."""
+"""Everything in a 3-D picture except the fluid: up direction, floor, container, lamps and camera."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from cortado.scene.shape_tables import INDEX_OF_AXIS, BoxContainer, Container, C
 
 DROPS = 0.002
 ENOUGH = 1_000_000
-"""Number of sampled positions that determine the extent of the fluid."""
+"""Number of particle positions that suffices to find the extent of the fluid."""
 Box = tuple[Points, Points]
-"""Two points (d,) [m], such as two corners."""
+"""Two points (d,) [m], such as the lower and the upper corner of a box."""
 TINT = 2.6
 """Ratio of absorption to scattering for fluids without a material."""
 SPAN = 0.1
@@ -25,17 +25,19 @@ SPAN = 0.1
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
-    """Return a sample of the positions (n, d) or (frames, n, d) [m], as states (m, d) [m] inside the periodic box."""
+    """Return a sample of the particle positions in each state, as arrays (m, d) [m] inside the periodic box.
+    ``positions`` is one state (n, d) [m] or several."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
     return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
 
 
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return the lower and the upper corner (d,) [m] of the shown fluid in states (n, d) [m].
+    """Return the lower and the upper corner (d,) [m] of the region that shows the fluid. ``states`` are arrays of
+    positions (n, d) [m].
 
-    The whole first state is shown. Of later states only the bulk is shown, and drops near the first state and near the
-    boxes ``around``. Drops that fall far away do not make the picture smaller.
+    The region contains all fluid of the first state. From later states it contains the bulk, and drops near the first
+    state or near the boxes ``around``. Drops that fall far away do not make the fluid look smaller.
     """
     first, *later = states
     found = [_ends(first, DROPS)]
@@ -57,11 +59,12 @@ def _ends(positions: Points, share: float) -> tuple[Points, Points]:
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """Return scattering and absorption (phases, 2) [1/m] for contents of ``size`` [m], and the transparency. The
-    transparency is the mean fraction of light that passes through the thickness `SPAN`.
+    """Return the scattering and absorption coefficients of each phase (phases, 2) [1/m], and the transparency. The
+    transparency is the mean fraction of light that passes through a layer of fluid. The layer's thickness is `SPAN`
+    times ``size`` [m].
 
-    The material of a phase determines the values, unless the picture sets a transparency or does not show the colours
-    of phases.
+    The material of each phase determines its coefficients. If the picture sets a transparency, or does not show the
+    colours of phases, the transparency determines the coefficients.
     """
     picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
     by_phase, transparency = picture.colour == "phase", picture.transparency
@@ -85,18 +88,19 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
 
 @dataclass(frozen=True)
 class Stage:
-    """The surroundings of the fluid in picture axes: y points up, and the origin is in the middle of the contents."""
+    """Everything in a 3-D picture except the fluid, in picture axes. The picture's y axis points up, and its origin is
+    in the middle of the container or of the fluid."""
 
     frame: Points
-    """Rotation from the axes of the scene to picture axes (3, 3)."""
+    """Rotation matrix (3, 3) from scene axes to picture axes."""
     origin: Points
-    """Origin of the picture axes in the scene (3,) [m]."""
+    """Position of the origin of picture axes (3,) [m], in scene axes."""
     lower: Points
-    """Lower corner of the contents in picture axes (3,) [m]."""
+    """Lower corner (3,) [m] of a box around the fluid and the container, in picture axes."""
     upper: Points
-    """Upper corner of the contents in picture axes (3,) [m]."""
+    """Upper corner (3,) [m] of a box around the fluid and the container, in picture axes."""
     seen: tuple[Points, Points]
-    """Lower and upper corner (3,) [m] of the camera's region, in picture axes."""
+    """Lower and upper corner (3,) [m] of the region that the camera shows, in picture axes."""
     elevation: float
     """Elevation of the camera [degrees]."""
     eye: Points
@@ -104,19 +108,19 @@ class Stage:
     look_at: Points
     """Point at which the camera looks (3,) [m]."""
     azimuth: float
-    """Azimuth of the camera in the first view [degrees]."""
+    """Initial azimuth of the camera [degrees]."""
     picture: Picture
     container: Any
     spacing: float
     """Particle spacing [m]."""
     transparency: float
-    """Fraction of light that passes through the thickness `SPAN` of fluid."""
+    """Fraction of light that passes through a layer of fluid, from `media_of`."""
     media: Points
-    """Scattering and absorption (phases, 2) [1/m] from `media_of`."""
+    """Scattering and absorption coefficients of each phase (phases, 2) [1/m], from `media_of`."""
     cuts: bool
     """True if fluid is shown only inside the container."""
     solids: tuple[ShownSolid, ...]
-    """Solids in picture axes."""
+    """Solids of the scene, in picture axes."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "Stage":
@@ -145,7 +149,8 @@ class Stage:
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """Return the stage for a new picture, which shows all between the corners ``ends`` (3,) [m] of the scene."""
+        """Return the stage with a camera for a new picture. The camera shows the box between the corners ``ends`` (3,)
+        [m], given in scene axes."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
         if picture.look_at is not None:
@@ -163,7 +168,7 @@ class Stage:
 
     @property
     def seen_size(self) -> Points:
-        """Width and height of the camera's view at the contents (2,) [m]."""
+        """Width and height (2,) [m] of the shown region, seen from the camera."""
         return np.ptp(corners(*self.seen) @ np.stack(screen_axes(self.look_at - self.eye), axis=1), axis=0)
 
     @property
@@ -172,7 +177,8 @@ class Stage:
 
     @property
     def home_around(self) -> View:
-        """First view of an orbiting camera, which sees everything from every side, or [picture]'s own camera."""
+        """First view of a camera that circles the scene. If the table [picture] has no camera, the camera is far enough
+        away to show everything from every side."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -183,7 +189,8 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """Return the stage with the solids of the scene ``pose`` and the camera at ``view``. None changes nothing."""
+        """Return the stage with the solids of the scene ``pose`` and the camera at ``view``. If an argument is None,
+        the solids or the camera are unchanged."""
         found = self
         if pose is not None:
             solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
@@ -200,15 +207,16 @@ class Stage:
 
     @property
     def size(self) -> float:
-        """Greatest side of the contents [m]."""
+        """Greatest side of the box around the fluid and the container [m]."""
         return float((self.upper - self.lower).max())
 
     def placed(self, positions: Points) -> Points:
-        """Convert positions (n, 3) [m] from the axes of the scene to picture axes."""
+        """Convert positions (n, 3) [m] from scene axes to picture axes."""
         return (positions - self.origin) @ self.frame.T
 
     def on_screen(self, points: Points) -> Points:
-        """Return column and row in the picture (n, 2) of points of the scene (n, 3) [m], from the upper left corner."""
+        """Convert points (n, 3) [m] in scene axes to pixel coordinates (n, 2): column and row, counted from the upper
+        left corner."""
         forward = self.look_at - self.eye
         forward = forward / np.linalg.norm(forward)
         off = self.placed(points) - self.eye
@@ -222,7 +230,8 @@ class Stage:
 
     @property
     def glass_frame(self) -> Points:
-        """Rotation (3, 3) from picture axes to container axes. The axis of a cylinder is the second container axis."""
+        """Rotation matrix (3, 3) from picture axes to container axes. The second container axis is the axis of a
+        cylindrical container."""
         if not isinstance(self.container, CylinderContainer):
             return np.eye(3)
         axis = INDEX_OF_AXIS[self.container.axis]
@@ -231,13 +240,14 @@ class Stage:
 
     @property
     def glass_ends(self) -> tuple[Points, Points]:
-        """Lower and upper corner of the container (3,) [m], in the axes of `glass_frame`."""
+        """Lower and upper corner of the container (3,) [m], in container axes."""
         return _box(self.placed(corners(*self.container.extent())) @ self.glass_frame.T)
 
     @property
     def room(self) -> tuple[Points, Points]:
-        """Lower and upper corner (3,) [m] of the shown fluid, in the axes of `glass_frame`. The region is infinite
-        along periodic axes and upwards, because emitters may be above the container."""
+        """Lower and upper corner (3,) [m] of the region in which fluid is shown, in container axes. The region is
+        infinite along periodic axes. The region is also infinite upwards, because emitters may be above the container.
+        """
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
         axis = int(np.abs(up).argmax())
@@ -250,7 +260,8 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """Mask (2, 3) of the sides of a box that are panes of glass: lower and upper ends, for each axis."""
+        """Mask (2, 3) of the container's sides that are panes of glass. The first index is 0 for lower and 1 for upper
+        sides, and the second index is the axis."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -282,8 +293,8 @@ def spilled(container: Container, positions: Points, spacing: float) -> bool:
 
 
 def upright(gravity: Points) -> Points:
-    """Return the rotation (3, 3) from the axes of the scene to the directions right, up, and towards the viewer. Up is
-    the axis opposite to gravity (3,), or y without gravity."""
+    """Return the rotation matrix (3, 3) from scene axes to picture axes, which point right, up, and towards the viewer.
+    The direction up is opposite to gravity (3,), or along y without gravity."""
     axis = int(np.abs(gravity).argmax()) if gravity.any() else 1
     up, towards = np.zeros(3), np.zeros(3)
     up[axis] = -1.0 if gravity[axis] > 0.0 else 1.0
@@ -297,7 +308,8 @@ def _towards(azimuth: float, elevation: float) -> Points:
 
 
 def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = 24.0) -> Box:
-    """Return the camera's position (3,) [m] and the middle of its view (3,) [m], so that a box fills the picture."""
+    """Return a camera position (3,) [m] and the point (3,) [m] at which the camera looks. The box from ``lower`` to
+    ``upper`` (3,) [m] then fills the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / 1.10
     halves = half, half * picture.height / picture.width
@@ -314,7 +326,8 @@ def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azi
 
 
 def screen_axes(forward: Points) -> tuple[Points, Points]:
-    """Return the unit vectors (3,) to the right and upwards on the screen, seen along ``forward`` (3,)."""
+    """Return two unit vectors (3,) that point right and up on the screen, for a camera that looks along ``forward``
+    (3,)."""
     helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 * np.linalg.norm(forward) else np.array([0, 0, -1.0])
     right = np.cross(forward, helper)
     right /= np.linalg.norm(right)

@@ -1,9 +1,12 @@
 """Emission and absorption of light along a ray through the colour field, from front to back (Max 1995).
 
-The colour field consists of the coverage A and the colour times coverage P. A sample of optical thickness u = kappa ds
-A, with extinction kappa and step ds, transmits the fraction exp(-u) of the light from behind it. The sample adds kappa
-ds P E(u), with E(u) = (1 - exp(-u)) / u. This is the emission of a layer of colour P / A, written without a division by
-A. With the transmittance T_s in front of sample s of S samples, and T_0 = 1,
+The colour field consists of the coverage A and the colour times coverage P. A sample has the optical thickness u =
+kappa ds A, with extinction kappa and step ds. The sample transmits the fraction exp(-u) of the light from behind it.
+
+The sample emits the light kappa ds P E(u), with E(u) = (1 - exp(-u)) / u. A layer of colour P / A emits the same light,
+but the formula has no division by A.
+
+The transmittance in front of sample s is T_s, with T_0 = 1. For S samples the image is
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 
@@ -32,12 +35,13 @@ SAMPLES_PER_CELL = 2
 
 @cache
 def brightness_functions(precision: Precision) -> tuple[Any, Any]:
-    """Return Warp functions of E(u) = (1 - exp(-u)) / u and of its derivative. The arguments are u and exp(-u)."""
+    """Return two Warp functions: E(u) = (1 - exp(-u)) / u, and its derivative. The arguments of both functions are u
+    and exp(-u)."""
     real = precision.real
 
     @wp.func
     def brightness(u: real, passed: real) -> real:
-        """Return E(u). For u below 0.1 the series sum_n (-u)^n / (n + 1)! is used."""
+        """Return E(u) = (1 - exp(-u)) / u. For u below 0.1 a power series is used."""
         if u > real(0.1):
             return (real(1.0) - passed) / u
         total = real(1.0)
@@ -47,7 +51,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
     @wp.func
     def brightness_derivative(u: real, passed: real) -> real:
-        """Return the derivative of E(u). For u below 0.1 the series -sum_n (n + 1) (-u)^n / (n + 2)! is used."""
+        """Return the derivative of E(u) with respect to u. For u below 0.1 a power series is used."""
         if u > real(0.1):
             return (passed * (real(1.0) + u) - real(1.0)) / (u * u)
         total = real(1.0)
@@ -60,7 +64,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
-    """Return the kernels of ray marching, and the kernel of the adjoint of the colour field."""
+    """Return the kernels of ray marching, and a kernel for the adjoint of the colour field."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), precision.six
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     change = camera_tangent_type(precision)
@@ -82,7 +86,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def march(camera, nodes, thickness: real, background: vector, field, image, spans):
-        """Compute the image of a field. ``spans`` are the ranges of samples inside the grid for each ray."""
+        """Compute the image of a colour field. ``spans`` has the range of samples inside the grid for each ray."""
         pixel = wp.tid()
         o = start(pixel, camera)
         d = direction(pixel, camera)
@@ -135,7 +139,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     def march_adjoint(
         camera, nodes, thickness: real, field, image, spans, image_bar, samples_bar: samples, pose_bar: poses
     ):
-        """Compute the adjoints of the samples of each ray, and of the camera's pose."""
+        """Compute the adjoints of the samples on each ray, and the adjoint of the camera's pose."""
         pixel = wp.tid()
         bar = image_bar[pixel]
         o = start(pixel, camera)
@@ -167,7 +171,8 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def gather(camera, nodes, spans, samples_bar: samples, field_bar):
-        """Compute the adjoint of each node from the adjoints of samples in the eight cells around the node."""
+        """Compute the adjoint of each grid node, from the adjoints of the samples in the eight cells around
+        the node."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         lower = x_g - diagonal(nodes)
@@ -189,7 +194,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
 
 
 class RayMarcher:
-    """Renders colour fields in one view by ray marching. Each call of ``adjoint`` overwrites the previous result."""
+    """Renders colour fields from one view by ray marching. Each call of ``adjoint`` overwrites the previous result."""
 
     def __init__(self, view: View, nodes: Any, precision: Precision, device: Any):
         self._step = step = nodes.cell / SAMPLES_PER_CELL
@@ -206,7 +211,7 @@ class RayMarcher:
         self.pixels, self._precision, self._device = self._camera.rows * self._camera.columns, precision, device
         require(picture_parts(self.pixels, precision.bytes), "take a smaller resolution", device)
         self.image, self._image_bar = (self._zeros(self.pixels, dtype=precision.vector) for _ in range(2))
-        """Image and its adjoint (pixels,), in linear RGB."""
+        """The image (pixels,) in linear RGB, and the adjoint of the image (pixels,)."""
         self._spans = self._zeros(self.pixels, dtype=wp.vec2i)
         self._known = {"camera": self._camera, "nodes": nodes, "thickness": self._thickness}
         self._known |= {"image": self.image, "spans": self._spans}
@@ -217,7 +222,7 @@ class RayMarcher:
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
-        """Return the tangent (pixels,) of the image along tangents of the field and of the view. The next call of
+        """Return the tangent of the image (pixels,), given the tangents of the field and of the view. The next call of
         ``tangent`` or ``adjoint`` overwrites the result."""
         vector, camera_dot = self._precision.vector, camera_tangent_type(self._precision)()
         camera_dot.position, camera_dot.turn = vector(*along.translation), vector(*along.rotation)
@@ -228,8 +233,8 @@ class RayMarcher:
         return self._image_bar
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
-        """Return derivatives with respect to the field and the pose (6,), given the derivative with respect to the
-        image (pixels, 3)."""
+        """Return the derivatives with respect to the field and with respect to the camera's pose (6,). ``image_bar``
+        (pixels, 3) is the derivative with respect to the image."""
         self._image_bar.assign(image_bar)
         bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
         launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)

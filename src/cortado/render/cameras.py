@@ -1,6 +1,6 @@
 """Cameras and views. A view consists of a camera, the extinction of the fluid and the background.
 
-A `Calibration` turns unknown numbers of a view into parameters.
+A `Calibration` makes unknown properties of a view, such as the camera's position, into parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ Vector = tuple[float, ...]
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
-    """Return ``values`` as a tuple of the given length. Raises `InputError` unless they are finite numbers. Errors
-    mention the argument ``name``."""
+    """Return ``values`` as a tuple of the given length. Raises `InputError` for values that are not finite numbers, or
+    for a wrong length. The error mentions the argument ``name``."""
     found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
@@ -33,7 +33,8 @@ def positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class Camera:
-    """Base class of cameras. Samples on a ray are evenly spaced between ``near`` and ``far``."""
+    """Base class of cameras. A renderer samples the fluid at evenly spaced points on each ray, between ``near`` and
+    ``far``."""
 
     position: Vector
     """Position of the camera [m], (3,)."""
@@ -44,9 +45,9 @@ class Camera:
     resolution: tuple[int, int] = field(default=(256, 256), kw_only=True)
     """Numbers of columns and rows; pixels are square."""
     near: float = field(default=0.0, kw_only=True)
-    """Distance from the camera to the first samples [m]."""
+    """Distance from the camera to the first sample on a ray [m]."""
     far: float | None = field(default=None, kw_only=True)
-    """Distance from the camera to the last samples [m], by default twice the distance to ``look_at``."""
+    """Distance from the camera to the last sample on a ray [m], by default twice the distance to ``look_at``."""
 
     def __post_init__(self) -> None:
         for name in ("position", "look_at", "up"):
@@ -66,7 +67,7 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """Distance ``far`` [m], or its default."""
+        """Distance from the camera to the last sample on a ray [m]: ``far``, or its default."""
         assert self.far is not None
         return self.far
 
@@ -81,11 +82,13 @@ class Camera:
 
     @property
     def half_width(self) -> tuple[float, float]:
-        """Half of the visible width at the camera [m], and its growth per unit of depth [-]."""
+        """Half the width of the visible region at the camera [m], and the growth of this half width per metre of depth
+        [-]."""
         raise NotImplementedError
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
-        """Return the camera after a translation (3,) [m] and a turn about its position, a rotation vector (3,) [rad].
+        """Return the camera after a ``translation`` (3,) [m] and a ``rotation`` about its position. The rotation is a
+        rotation vector (3,) [rad].
 
         The renderer returns derivatives with respect to the translation and rotation at zero.
         """
@@ -112,7 +115,7 @@ class Orthographic(Camera):
     """
 
     width: float
-    """Width of the shown region [m]."""
+    """Width of the region that the picture shows [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -152,7 +155,7 @@ class Perspective(Camera):
 
 
 def check_resolution(resolution: tuple[int, int]) -> None:
-    """Raise `InputError` unless ``resolution`` is two positive whole numbers."""
+    """Raise `InputError` if ``resolution`` is not a pair of positive whole numbers."""
     whole = isinstance(resolution, Sequence) and all(is_whole(n) and n > 0 for n in resolution)
     if not whole or len(resolution) != 2:
         wanted = "two positive whole numbers, columns and rows"
@@ -162,7 +165,7 @@ def check_resolution(resolution: tuple[int, int]) -> None:
 WHITE = (1.0, 1.0, 1.0)
 ZERO = (0.0, 0.0, 0.0)
 NUDGE = 1e-6
-"""Step of finite differences with respect to a rotation vector [rad]."""
+"""Step for finite differences with respect to a rotation vector [rad]."""
 
 
 class View(Protocol):
@@ -173,7 +176,7 @@ class View(Protocol):
 
     @property
     def extinction(self) -> float:
-        """Extinction of fluid with coverage 1 [1 / m]."""
+        """Extinction coefficient of fluid with coverage 1 [1 / m]."""
         ...
 
     @property
@@ -203,9 +206,9 @@ class Volume:
 class TopView:
     """A view of the free surface from above, as a barista sees latte art.
 
-    The picture shows the whole container along the up axis, not mirrored. With y upwards, columns run along x and rows
-    along z, with the lowest z in row 0. With z upwards, columns run along x and rows against y, as in a plot. With x
-    upwards, columns run along y and rows against z.
+    The picture shows the whole container, seen along the up axis and not mirrored. With y upwards, columns run along x
+    and rows along z, with the lowest z in row 0. With z upwards, columns run along x and rows against y, as in a plot.
+    With x upwards, columns run along y and rows against z.
     """
 
     lower: Vector
@@ -252,24 +255,25 @@ class TopView:
 
 @dataclass(frozen=True)
 class ViewTangent:
-    """A direction of change of a view, for a directional derivative."""
+    """Rates of change of a view's properties, for a directional derivative."""
 
     translation: Vector = ZERO
     """Translation of the camera (3,) [m]."""
     rotation: Vector = ZERO
     """Rotation vector (3,) of the camera about its position [rad]."""
     half_width: tuple[float, float] = (0.0, 0.0)
-    """Change of `Camera.half_width`: half width at the camera [m], and growth with depth [-]."""
+    """Change of the two numbers in `Camera.half_width`: half width at the camera [m], and growth with depth [-]."""
     extinction: float = 0.0
-    """Change of the extinction [1 / m]."""
+    """Change of the extinction coefficient [1 / m]."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Unknown numbers of a view as parameters. The approximate view is ``aimed``.
+    """Unknown properties of a view as parameters. The view ``aimed`` has approximate values of these properties.
 
-    The parameters are "translation" (3,) [m] and "rotation" (3,) [rad] of the camera, its "field_of_view" [degrees] or,
-    with parallel rays, "width" [m], and the "extinction" of the fluid [1/m].
+    The possible parameters are "translation" (3,) [m] and "rotation" (3,) [rad] of the camera, and the "extinction" of
+    the fluid [1/m]. A perspective camera also has the "field_of_view" [degrees], and a camera with parallel rays has
+    the "width" [m].
     """
 
     aimed: View
@@ -282,13 +286,13 @@ class Calibration:
 
     @property
     def start(self) -> dict[str, np.ndarray]:
-        """Values of the unknown numbers in the view ``aimed``."""
+        """Values of the unknown parameters in the view ``aimed``."""
         return {name: self._values[name] for name in self.names}
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """Masks by name that are True for numbers without effect on pictures. An example is the movement of a camera
-        with parallel rays along the viewing direction."""
+        """Masks by parameter name, which are True for components without effect on pictures. For parallel rays, an
+        example is the camera's movement along the viewing direction."""
         camera = self.aimed.camera
         if "translation" not in self.names or not isinstance(camera, Orthographic):
             return {}
@@ -296,7 +300,7 @@ class Calibration:
         return {"translation": np.isclose(np.abs(sight), np.linalg.norm(sight))}
 
     def view(self, values: Mapping[str, np.ndarray]) -> View:
-        """Return the view with the given values. Raises `InputError` for invalid values."""
+        """Return the view with the given parameter ``values``. Raises `InputError` for invalid values."""
         if not self.names:
             return self.aimed
         all_values = {**self._values, **values}
@@ -308,7 +312,8 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """Return the change of the view at ``values`` along ``directions``. Omitted directions are 0."""
+        """Return the rate of change of the view at the parameter ``values`` along ``directions``. Omitted directions
+        are 0."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO

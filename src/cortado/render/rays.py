@@ -1,11 +1,13 @@
 """Rays of a camera, and interpolation of the colour field at samples on a ray.
 
 In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) are in units of half the
-width of the picture: u runs from -1 to 1, and v upwards. At depth z the pixel (u, v) sees the point (w u, w v, -z),
-with the half width w = half_width + growth z. For parallel rays growth is 0. For rays from one point half_width is 0.
+width of the picture: u runs from -1 to 1 to the right, and v upwards. At depth z the pixel (u, v) shows the point (w u,
+w v, -z), with the half width w = half_width + growth z. For parallel rays growth is 0. For rays from one point
+half_width is 0.
 
-The field at a sample is interpolated trilinearly between nodes, and is 0 outside the grid. It is therefore continuous.
-In 2-D, the field has one layer of nodes and appears as a sheet with the thickness of the node distance.
+The field at a sample is interpolated trilinearly between nodes, and is 0 outside the grid. The interpolated field is
+therefore continuous. In 2-D, the grid has one layer of nodes. The fluid then appears as a sheet whose thickness is the
+node distance.
 """
 
 from functools import cache
@@ -20,8 +22,8 @@ from cortado.render.colour_field import nodes_type, rgba_type
 @cache
 def camera_type(precision: Precision) -> Any:
     """Return the Warp struct of a camera. The columns of ``orientation`` point right, up and backwards. ``half_width``
-    [m] is half the visible width at the camera, and ``growth`` [-] is its growth with depth. Samples along a ray begin
-    at the distance ``near`` [m] and are ``step`` [m] apart."""
+    [m] is half the visible width at the camera. ``growth`` [-] is the increase of the half width per depth. Samples
+    along a ray begin at the distance ``near`` [m] and are ``step`` [m] apart."""
     real, pixels = precision.real, {"columns": wp.int32, "rows": wp.int32}
     pose, widths = {"position": precision.vector, "orientation": precision.matrix}, {"half_width": real, "growth": real}
     ray = {"near": real, "step": real, "samples": wp.int32}

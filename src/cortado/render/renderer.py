@@ -147,14 +147,16 @@ class Renderer:
 
     @WARP
     def render(self, positions: Any, fractions: Any = None, colours: Any = None) -> np.ndarray:
-        """Return the picture (rows, columns, 3) in float64, with row 0 at the top: ``render(trajectory[-1])``.
+        """Return the picture (rows, columns, 3) in float64, with row 0 at the top.
 
         Args:
-            positions: a frame such as ``trajectory[k]`` or ``problem.end(parameters)``, which includes mass fractions
-            and perhaps colours; or (n, d) [m]; or a Warp array (n,) of vectors in the renderer's precision and on its
-            device.
+            positions: a frame, positions (n, d) [m], or a Warp array (n,) of vectors in the renderer's precision and on
+            its device. A frame, such as ``trajectory[-1]`` or ``problem.end(parameters)``, also contains mass
+            fractions and perhaps colours.
             fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; not needed for a single phase.
             colours: (phases, 3) colours of the phases; by default the renderer's colours.
+
+        Example: ``picture = renderer.render(trajectory[-1])``
         """
         if hasattr(positions, "positions"):
             frame, positions = positions, positions.positions
@@ -250,7 +252,7 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 UP = {2: 2, 3: 1}
-"""Index of the upward axis by dimension. In 2-D this is the axis perpendicular to the plane."""
+"""Index of the upward axis by dimension. In 2-D the upward axis is perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
 """Ratio of node distance to particle spacing, by dimension. With coarser grids optimisers can get stuck."""
 CLEARNESS = 8.0
@@ -259,7 +261,7 @@ CAMERA = ("position", "look_at", "field_of_view", "extinction")
 
 
 def scene_renderer(simulation: Any, extinction_factor: float = 1.0, **settings: Any) -> Renderer:
-    """Make a renderer for a `cortado.Simulation` from the table [render] of its scene, by default a view from above.
+    """Make a renderer for a `cortado.Simulation` from the table [render] of its scene. The default view is from above.
 
     ``extinction_factor`` multiplies the extinction. ``settings`` replace keys of the table; see `Simulation.renderer`.
     """

@@ -55,7 +55,8 @@ class Checkpoints:
             self._states[n] = partial(_itself, state)
 
     def state(self, n: int, next_state: Callable[[int, State], State]) -> State:
-        """Return state ``n``, recomputed by ``next_state(m, state m)`` if needed. Calls must have decreasing ``n``."""
+        """Return state ``n``. A state between checkpoints is recomputed by ``next_state(m, state m)``. ``n`` must
+        decrease from call to call."""
         if n not in self._states:
             for m in range(n - n % self._interval, n):
                 self._states[m + 1] = partial(_itself, next_state(m, self._states[m]()))
@@ -85,7 +86,7 @@ class Progress:
 
     def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
         """Return the first state of the resumed run, its step number, and True if the run ends there. Raises
-        `InputError` if ``keep`` is true after steps of an earlier process."""
+        `InputError` if ``keep`` is true and an earlier process took steps."""
         if self.state is None:
             return initial, 0, False
         if keep:
@@ -114,13 +115,13 @@ class ChunkReader(Protocol):
         """Return the kernel launches after each step, or None."""
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
-        """Read the states before the steps from ``step`` to ``end``: the state ``first``, and the states of ``later``.
-        The next chunk overwrites the states."""
+        """Read the states before the steps ``step`` to ``end`` - 1. ``first`` is the state before step ``step``, and
+        ``later`` contains the following states. The next chunk overwrites the states."""
 
 
 def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
-    """Return the error for a lost particle of scene ``member``. ``known`` are two or more states up to the
-    failed step."""
+    """Return the error for a lost particle of scene ``member``. ``known`` are the last states, up to the state before
+    the failed step."""
     containment, particles = solver.containment, solver.layout.particles
     spacing, d = containment.walled.spacing, containment.walled.dimension
     own = slice(member * particles, (member + 1) * particles)

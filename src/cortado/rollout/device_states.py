@@ -30,8 +30,8 @@ OfLost = Mapping[int, float]
 
 
 def of_lost(rollout: Rollout, given: State, times: np.ndarray, parameters: Parameters | None = None) -> OfLost:
-    """Return the derivative for each lost scene: 0 if all given derivatives of the scene are 0, and NaN for any other
-    lost scene."""
+    """Return the derivative for each lost scene. The derivative is 0 if all ``given`` derivatives of the scene are 0,
+    and otherwise NaN."""
     found = {}
     for b in rollout.lost:
         own = [array.numpy() for array in given.member(b).arrays()]
@@ -110,7 +110,8 @@ class HostStates:
                 raise InputError(f"{what} has a value that is not finite, but must be numbers.")
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
-        """Return derivatives by field name in float64. The derivatives of lost scenes are in ``lost``."""
+        """Return derivatives by field name in float64. Derivatives of lost scenes are replaced by the values in
+        ``lost``."""
         found = {name: array.astype(np.float64) for name, array in state.numpy(self._simulation.dimension).items()}
         return without_lost(lost, found)
 
@@ -127,7 +128,7 @@ def require_fields(what: str, given: Values, state: State) -> Values:
 
 
 def time_of(what: str, given: Values, state: State) -> np.ndarray:
-    """Return the derivative with respect to the time of a state, () or (batch,). It is 0 if missing."""
+    """Return the derivative with respect to the time of a state, () or (batch,). A missing derivative is 0."""
     members = () if state.batch is None else (state.batch,)
     found = as_numbers(f"{what} {STATE_TIME}", given.get(STATE_TIME, np.zeros(members)))
     if found.shape != members:
@@ -136,7 +137,7 @@ def time_of(what: str, given: Values, state: State) -> np.ndarray:
 
 
 def scenes_after(rollout: Rollout, steps: int) -> list[RestartState]:
-    """Return restart states without fields that have each scene's clock and origin after ``steps`` steps."""
+    """Return the clock and the origin of each scene after ``steps`` steps, as restart states without fields."""
     made, found = dict[tuple[int, float, int], RestartState](), []
     for clock, size, origin in zip(rollout.clocks, rollout.time_steps.tolist(), rollout.origins, strict=True):
         key = id(clock), size, id(origin)
@@ -161,8 +162,8 @@ class DeviceState:
     """Clock and origin of each scene, as restart states without fields."""
 
     def __getitem__(self, name: str) -> wp.array:
-        """Return a field by name: (n, 3) for vectors, (n, phases) for fractions, (n,) for numbers. For a batch, the
-        first axis counts the scenes."""
+        """Return a field by name. Vectors have the shape (n, 3), mass fractions (n, phases), and scalars (n,). For a
+        batch, the first axis counts the scenes."""
         if name not in self.arrays.names:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.arrays.names)}.")
         return self.arrays.numbers(name)
@@ -277,8 +278,7 @@ def _without_lost(lost: OfLost, state: State) -> State:
 
 
 def flat_of(arrays: Sequence[Any]) -> wp.array | None:
-    """Return Warp arrays of numbers as one flat array in the same memory, or None unless they lie one after the
-    other."""
+    """Return a flat Warp array in the memory of ``arrays``. Return None if the arrays are not contiguous in memory."""
     first = arrays[0] if arrays else None
     if not isinstance(first, wp.array):
         return None
@@ -291,7 +291,8 @@ def flat_of(arrays: Sequence[Any]) -> wp.array | None:
 
 
 class Packed:
-    """The fields of a state on a GPU, one after the other in a flat array. Doubles are left out."""
+    """The fields of a state on a GPU, one after the other in a flat array. Fields of kind `Entry.DOUBLE` are
+    left out."""
 
     def __init__(self, state: State, dimension: int):
         narrow, doubles = state.narrow(dimension), {f.name for f in state.fields if f.entry is Entry.DOUBLE}
@@ -313,9 +314,10 @@ def _copy_all(to: Mapping[str, wp.array], given: Mapping[str, wp.array]) -> None
 
 
 class DeviceRows:
-    """Parameters over time as Warp arrays on the device, in the simulation's precision. Numbers have shape (1,).
+    """Parameters over time as Warp arrays on the device, in the simulation's precision. A parameter with one number has
+    the shape (1,).
 
-    Values are not checked. They may be infinite, and a solid may move too far in a time step.
+    The values are not checked. A value may be infinite, or may move a solid too far in a time step.
     """
 
     def __init__(self, simulation: Simulated, space: ParameterSpace):
@@ -353,7 +355,8 @@ class DeviceRows:
                 launch(self._spread, numbers.shape, numbers.device, given=given, rows=numbers)
 
     def adjoints(self, rows: Mapping[str, wp.array], found: Parameters, lost: OfLost) -> dict[str, wp.array]:
-        """Sum the adjoints ``found`` over all scenes and time steps with the same value."""
+        """Return the adjoints of the parameters on the device. The adjoints ``found`` are summed over the scenes and
+        time steps that share a value."""
         adjoints = {}
         for name, array in rows.items():
             bars, shape = found.numbers(name), self._in_three(name, array).shape

@@ -32,7 +32,7 @@ from cortado.scene.scene_warnings import viscosity_sentence
 from cortado.scene.stability import divergence_advice
 
 SAME = 1e-9
-"""Relative tolerance of times."""
+"""Relative tolerance for equal times."""
 STATE_TIME = "time"
 _VARIED = frozenset({"mobility", "viscosity"})
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
@@ -41,7 +41,7 @@ DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
 class ParameterSpace:
     """Converts parameters by name to the arrays of a rollout, and adjoints of the arrays to gradients.
 
-    In a batch, a value applies to all scenes, or it has a first axis for the scenes.
+    In a batch, the value of a parameter applies to all scenes or has a first axis for the scenes.
     """
 
     def __init__(self, simulation: Simulated, steps: int):
@@ -53,7 +53,6 @@ class ParameterSpace:
         self._told: set[str] = set()
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
         self._judged: tuple[Arrays, float] | None = None
-        """The last judged values, and the square of the strongest gravity among those that differ in nothing else."""
         self._have_checks = any(hasattr(maker, "check") for maker in simulation.forces)
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
@@ -70,7 +69,7 @@ class ParameterSpace:
         return found
 
     def _judge(self, values: Arrays) -> None:
-        """Raise `InputError` for values that a run cannot take, or warn, unless the last values were the same."""
+        """Raise `InputError` or warn if a run with these values would fail. Unchanged values are not checked again."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()
         changed = [name for name, value in values.items() if is_first or not np.array_equal(value, last[name])]
@@ -125,7 +124,7 @@ class ParameterSpace:
     ) -> None:
         """Set the first state and the parameters of a rollout. ``values`` replace the scene's values.
 
-        ``varied`` are the parameters with wanted derivatives. ``states`` replace the scene's first state.
+        ``varied`` names the parameters for derivatives. ``states`` replace the scene's first state.
         """
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if write is not None and self._goes_on(rollout, values, varied, states):
@@ -249,8 +248,8 @@ class ParameterSpace:
         parameters: Parameters,
         time_dots: np.ndarray | None = None,
     ) -> None:
-        """Write a direction to the tangents ``dot`` of the first state and to the tangents ``parameters``. ``along``
-        maps names of parameters to tangents.
+        """Write the tangents of the first state to ``dot``, and the tangents of the parameters to ``parameters``.
+        ``along`` maps names of parameters to tangents.
 
         ``time_dots`` (members,) are tangents of the times of the first states.
         """
@@ -357,8 +356,8 @@ class ParameterSpace:
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
-    """Return the number of steps of a run, from either ``steps`` or ``time`` [s]. With adaptive steps it is an upper
-    bound. Raises `InputError` unless exactly one of ``steps`` and ``time`` is given."""
+    """Return the number of steps of a run, from either ``steps`` or ``time`` [s]. With adaptive steps the number is an
+    upper bound. Raises `InputError` unless exactly one of ``steps`` and ``time`` is given."""
     if steps is None and time is None:
         raise InputError("steps is left out, but must be given, as no time is given.")
     if steps is not None and time is not None:

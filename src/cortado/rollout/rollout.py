@@ -33,7 +33,7 @@ OBSERVED = "a number of steps", "a state"
 CHUNK = {"cpu": 8, "cuda": 64}
 """Greatest number of steps in a chunk, by kind of device."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Number of particles times steps in a chunk above which longer chunks are not faster."""
+"""Number of particles times number of steps in a chunk. Above this product, longer chunks are not faster."""
 
 
 class BackwardStep(Protocol):
@@ -282,8 +282,8 @@ class Rollout(Staying):
 
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
-        """Return the adjoint of the first state. ``bars`` are adjoints of states by number. The next backward pass
-        overwrites the result.
+        """Return the adjoint of the first state. ``bars`` maps numbers of states to adjoints of the states. The next
+        backward pass overwrites the result.
 
         ``observe`` is called with the adjoint of every state, from the last to the first. Raises `InputError` unless
         ``forward`` has run to the end with ``keep``, the current first state and the current parameters.
@@ -369,7 +369,7 @@ REPLACED = *OF_RUNS, "clocks", "origins", "substeps", "advice", "goes_on", "eval
 
 
 class Residual:
-    """The data of an evaluation of a rollout, for a backward pass after later evaluations.
+    """Data of one evaluation of a rollout. With these data, a backward pass is possible after later evaluations.
 
     Before the next evaluation begins, the first state, the parameters and the log are copied to the residual.
     """

@@ -187,7 +187,7 @@ def _stretched(scene: Scene, values: Arrays) -> str | None:
 SAME = 1e-6
 """Relative tolerance for equal numbers, also after rounding to float32."""
 MIXED = 0.02
-"""Relative tolerance for the volume of mixed particles, and for the sum of their mass fractions."""
+"""Relative tolerance for the volumes of particles with several phases, and for the sums of their mass fractions."""
 
 
 def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:

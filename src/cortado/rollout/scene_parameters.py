@@ -45,7 +45,7 @@ class Simulated(Source, Protocol):
     lattice: Lattice
     """Constants of the rest lattice."""
     free_particles: int
-    """Number of particles outside emitters. They come first."""
+    """Number of particles outside emitters. In arrays, these particles come before the particles of emitters."""
 
     @property
     def dimension(self) -> int: ...
@@ -55,7 +55,7 @@ class Simulated(Source, Protocol):
         """Name of the solver if the solver adds fields to states, or None."""
 
     def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
-        """Return the number of diffusion substeps that is stable for each time step."""
+        """Return the number of diffusion substeps in a step that keeps diffusion stable."""
 
 
 class SceneParameters:
@@ -95,8 +95,8 @@ class SceneParameters:
         return np.arange(max(self._steps, 1)) + self._known[name].moment
 
     def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
-        """Return the derivatives (steps, ...) of the scheduled parameters with respect to the time step, or to the time
-        of the clock."""
+        """Return the derivatives (steps, ...) of the scheduled parameters with respect to the time step. With
+        ``of_clock``, return the derivatives with respect to the time of the clock."""
         found = {}
         for name, course in self.courses(values).items():
             times, moments = self._times(name, values, clock), self._moments(name)
@@ -134,8 +134,8 @@ class SceneParameters:
         return found
 
     def first(self, values: Arrays) -> Arrays:
-        """Return the fields of the first state that depend on ``values``. Raises `InputError` for mass fractions
-        without volume."""
+        """Return the fields of the first state that depend on ``values``. Raises `InputError` if mass fractions give a
+        particle no volume."""
         fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields

@@ -114,8 +114,8 @@ class Travel:
         return np.asarray(np.interp(np.asarray(times), self.times, self.lengths))
 
     def steps(self, duration: float, longest: float) -> float:
-        """Return an upper bound on the number of additional time steps for the paths in ``duration`` [s]. Without
-        paths, time steps have the length ``longest`` [s]."""
+        """Return an upper bound on the number of time steps that the paths add to ``duration`` [s]. Without paths, time
+        steps have the length ``longest`` [s]."""
         begins = np.concatenate([self.times, self.times - duration])
         way = float((self.at(begins + duration) - self.at(begins)).max())
         with np.errstate(divide="ignore"):
@@ -145,8 +145,8 @@ def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) 
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Make a rollout use adaptive time steps. Set the clocks and first states before. ``members`` are the values of
-    each scene."""
+    """Make a rollout use adaptive time steps. Before this call, set the clocks and first states. ``members`` has the
+    parameter values of each scene."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius

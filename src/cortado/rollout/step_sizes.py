@@ -41,7 +41,8 @@ class Retaken:
     def found(
         self, first: int, added: NDArray, sizes: NDArray, longest: NDArray, lost: dict[int, int]
     ) -> dict[tuple[int, int], float]:
-        """Return the first step to repeat in each scene, as new lengths [s] by (step, scene).
+        """Return the new length [s] of the first step that each scene must repeat. The keys of the result are pairs of
+        the step and the scene.
 
         Arrays have the shape (steps, members). ``added`` is the increase of compression, ``sizes`` are the lengths of
         the steps [s], and ``longest`` are the allowed lengths [s]. ``lost`` maps the number of a scene to the step that
@@ -142,7 +143,8 @@ class RecordedSizes:
 
 
 class StepSizes:
-    """The lengths of the time steps of a rollout. In this base class, they are the parameter ``time_step``."""
+    """The lengths of the time steps of a rollout. In this base class, the lengths are the values of the parameter
+    ``time_step``."""
 
     longest_chunk = 2**31
     """Greatest number of steps between two reads of step lengths."""
@@ -164,8 +166,8 @@ class StepSizes:
         """Set the solver to the recorded length of a step. The first ``step`` is 0."""
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """Read the lengths of the steps after states ``first`` to ``last``. Return the number of the last valid state,
-        and True if the run ends with it."""
+        """Read the lengths of the steps after the states ``first`` to ``last``. Return the number of the last valid
+        state, and True if the run ends with this state."""
         return last, False
 
     def again(self, first: int, last: int) -> bool:

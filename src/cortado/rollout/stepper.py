@@ -100,8 +100,8 @@ class AdjointGrowth:
     """The growth of the adjoint of states over successive calls of `Stepper.vjp`.
 
     Calls form a chain if the steps of each call end where the steps of the previous call began. The growth is the
-    smaller of two values: the growth of the norm over the whole chain, and the sum of the growths in the calls. The
-    norm of the adjoints x^ of positions and v^ of velocities is sqrt(|x^|^2 + |v^|^2 / T^2), where T is the duration of
+    smaller of two values: the growth of the norm over the whole chain, and the sum of the growths within each call. The
+    adjoints x^ of positions and v^ of velocities have the norm sqrt(|x^|^2 + |v^|^2 / T^2), where T is the duration of
     the chain.
     """
 
@@ -111,8 +111,8 @@ class AdjointGrowth:
         self._warned = False
 
     def follow(self, rollout: Rollout, squares: np.ndarray) -> None:
-        """Add the adjoints of the last and the first state of a call, given `sums_of_squares` of both. Warn
-        once if the growth exceeds `MOST_GROWTH`."""
+        """Add a call to the chain. ``squares`` is the result of `sums_of_squares` for the adjoints of the call's last
+        and first state. Warn once if the growth exceeds `MOST_GROWTH`."""
         size = float(rollout.time_steps[0])
         start, end = (rollout.clocks[0].after(steps, size).time for steps in (0, rollout.steps))
         into, out = np.sqrt(squares, dtype=np.float64).reshape(2, 2).tolist()
@@ -134,7 +134,8 @@ class AdjointGrowth:
 
 
 def sums_of_squares(*states: State) -> wp.array:
-    """Compute the sum of the squares of the positions and of the velocities of each state. A GPU is not waited for."""
+    """Compute the sum of the squares of the positions and of the velocities of each state. The function does not wait
+    for a GPU."""
     arrays = [array for state in states for array in (state.positions, state.velocities)]
     found = wp.empty(len(arrays), dtype=arrays[0].dtype._wp_scalar_type_, device=arrays[0].device)
     for k, array in enumerate(arrays):
@@ -157,7 +158,7 @@ class Stepper:
 
     @property
     def turn(self) -> Turn:
-        """Lock of the simulation, for one call at a time."""
+        """Lock of the simulation, which allows only one call at a time."""
         return self.rollout.turn
 
     @in_turn
@@ -184,7 +185,7 @@ class Stepper:
     @in_turn
     def advance(self, state: Any, parameters: Values | None = None, place: HostStates | None = None) -> Any:
         """Return the state after the steps. If ``state`` is on the device, the result is on the device. Parameters over
-        time may be Warp arrays on the device in the simulation's precision, which are not checked."""
+        time may be Warp arrays on the device, in the simulation's precision. Values in Warp arrays are not checked."""
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, place=place)
         return place.state(self.rollout, self._forward(keep=False), self.rollout.steps, state)
@@ -193,7 +194,7 @@ class Stepper:
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
         """Return the state after the steps, with the parameters of the last `advance` and new parameters over time.
 
-        ``rows`` are the values of all parameters over time, (batch, steps, ...). They are not checked.
+        ``rows`` are the values of all parameters over time, (batch, steps, ...). The values are not checked.
         """
         place = DeviceStates(self._simulation)
         if self._space.depends_on_time(rows):
@@ -224,10 +225,10 @@ class Stepper:
         """Return the adjoints of the first state and of the given parameters, given the adjoint ``state_bar`` of the
         last state (reverse mode). ``gradient`` is the estimator, by default the exact one; see `docs/gradients.md`.
 
-        The adjoint of a state is a table of arrays by field name, in the shapes of the fields, with a number ``time``.
-        Missing entries are 0. Arrays of a `DeviceState` are on the device, and arrays on the host are in float64. For a
-        batch, each array has a first axis for the scenes. Results for a lost scene are NaN, or 0 if its adjoint in
-        ``state_bar`` is 0.
+        The adjoint of a state is a dictionary of arrays by field name, with the shapes of the fields. The key ``time``
+        has a number. Missing fields are 0. Arrays of a `DeviceState` are on the device, and arrays on the host are in
+        float64. For a batch, each array has a first axis for the scenes. Results for a lost scene are 0 if the scene's
+        adjoint in ``state_bar`` is 0, and otherwise NaN.
 
         The adjoint of a parameter on the device is also on the device, in the shape of the parameter. Raises
         `InputError` for unknown fields and for wrong shapes.
@@ -323,7 +324,7 @@ class Stepping:
 
     @property
     def turn(self) -> Turn:
-        """Lock of the simulation, for one call at a time."""
+        """Lock of the simulation, which allows only one call at a time."""
         raise NotImplementedError
 
     def state(self, parameters: Values | None = None) -> States:
@@ -364,9 +365,10 @@ class Stepping:
         parameters, state=state)``.
 
         For a batch, the result is a tuple with the state of each scene, and the state of a lost scene is NaN. For a
-        `DeviceState`, the result is a `DeviceState`. ``parameters`` are any parameters of `Problem` except first
-        values, which ``state`` contains. A parameter over time has a first axis of length ``steps``. Further calls with
-        the same number of steps are faster. Warnings and errors are as in `Simulation.run`.
+        `DeviceState`, the result is a `DeviceState`. ``parameters`` are any parameters of `Problem` except initial
+        values, because ``state`` contains the initial values. A parameter over time has a first axis of length
+        ``steps``. Further calls with the same number of steps are faster. Warnings and errors are as in
+        `Simulation.run`.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
 

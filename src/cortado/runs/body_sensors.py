@@ -41,7 +41,8 @@ def six_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 class SpringLoads:
-    """The force and the length of a spring at the start of a time step, as the first two components of a load."""
+    """The force and the length of a spring at the start of a time step. Both are stored as the first two components of
+    a load."""
 
     def __init__(self, springs: Springs, spring: Ends):
         layout, self._springs, self._spring = springs.layout, springs, spring
@@ -85,8 +86,8 @@ def spring_loads(solver: ParticleSolver) -> dict[str, QuantityFormula]:
 class SpringForce(Summed):
     """A sensor of the force and the length of a spring.
 
-    The force is positive if the spring pulls and negative if the spring pushes. It includes the force of the damper,
-    for the velocities of the end points in the step after the state.
+    The force is positive if the spring pulls and negative if the spring pushes. The force includes the damper, with the
+    velocities of the end points in the step after the state.
 
     Example: ``run = simulation.run(100, sensors={"line": cortado.sensors.SpringForce("line")})``
     """

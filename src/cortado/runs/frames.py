@@ -132,7 +132,7 @@ class Pace:
     """Simulated seconds per second of the film [-]."""
     recorded: int
     enough: float
-    """Number of frames per simulated second for `USUAL` frames per second of the film [1/s]."""
+    """Frames per simulated second that give `USUAL` frames per second of the film [1/s]."""
     is_asked: bool
     of_search: bool = False
     """True for the film of a search."""

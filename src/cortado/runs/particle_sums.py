@@ -26,7 +26,7 @@ Axes = Literal["world", "body"]
 ACROSS = {1: 1.5, 2: 7.0 / np.pi}
 """Normalisation factor of the weights, by dimension."""
 LEAST_REACH = 5.0
-"""Least reach of the weights for an accuracy of 0.1 % [spacings]."""
+"""Smallest reach of the weights that gives an accuracy of 0.1 % [spacings]."""
 Across = Callable[[NDArray[Any]], NDArray[Any]]
 """A linear function from vectors (n, d) to vectors (n, k), such as a projection onto a plane."""
 
@@ -66,7 +66,7 @@ class Carrier:
         return self.turn[: len(self.begun), : len(self.begun)]
 
     def place(self, point: NDArray[Any]) -> NDArray[Any]:
-        """Return the current place [m] of an initial point (d,) [m] of the solid."""
+        """Return the current position [m] of the point of the solid that was initially at ``point`` (d,) [m]."""
         return np.asarray(self.pose.position + self.flat @ (point - self.begun))
 
     def arms(self, points: NDArray[Any]) -> NDArray[Any]:
@@ -127,7 +127,7 @@ def weights_of(q: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 @dataclass(frozen=True, eq=False)
 class Around:
-    """The place of a sensor, and its measure of distances."""
+    """The position of a sensor, and the function that measures distances from the sensor."""
 
     place: NDArray[Any]
     reach: float
@@ -150,7 +150,8 @@ class Around:
 
 @dataclass(frozen=True)
 class Image:
-    """Weights of the particles near a place, for one periodic image and one part of the particles."""
+    """Weights of the particles near a sensor, for one periodic image. Particles may be divided into parts; the weights
+    are then for one part of each particle."""
 
     near: NDArray[np.int_]
     ways: NDArray[Any]
@@ -235,7 +236,7 @@ class Summed(Sensor):
 
     @abstractmethod
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the reading (k,), given the sum (6,). Use only the poses of solids from the state."""
+        """Return the reading (k,), given the sum (6,). From the state, use only the poses of solids."""
 
 
 class LoadSensor(Summed):
@@ -275,7 +276,7 @@ class WeightedSum:
 
 @dataclass(frozen=True, eq=False)
 class RegionSum:
-    """Sums of the force and the torque of the quantity "wall_force" over the particles in a box."""
+    """Force and torque of the quantity "wall_force", summed over the particles in a box."""
 
     lower: NDArray[Any]
     upper: NDArray[Any]
@@ -302,7 +303,7 @@ class RegionSum:
 
 @dataclass(frozen=True)
 class LoadSum:
-    """A load on a solid, or 0 for a sensor of the motion of solids."""
+    """The load on a solid, or 0 for a sensor that only measures the motion of solids."""
 
     quantity: str | None = None
 

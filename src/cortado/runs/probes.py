@@ -219,9 +219,9 @@ class SolidLoad(LoadSensor):
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i.
 
-    The sums are over all particles i at x_i. The force f_i is opposite to the force of the solid's walls on the
-    particle, through pressure and, for no-slip walls, viscosity. It is the force in the step after the state, and c is
-    the middle of the solid at the end of this step. The solid gains exactly the momentum that the fluid loses. Not
+    The sums are over all particles i at x_i. The force f_i is minus the force of the solid's walls on particle i. Walls
+    act through pressure and, if they are no-slip walls, viscosity. Forces are those in the step after the state, and c
+    is the middle of the solid at the end of this step. The solid gains exactly the momentum that the fluid loses. Not
     included are contact, gravity, buoyancy in air, and user-defined forces between fluid and walls.
 
     Example: ``run = simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``

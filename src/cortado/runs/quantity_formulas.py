@@ -5,15 +5,16 @@ is an SPH sum over fluid neighbours (Monaghan 1992):
 
     c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
 
-G_ij is the kernel gradient. With the factor mu = -(V / d) sum_j x_j . G_j on the rest lattice, a rigidly rotating fluid
-has a vorticity of twice its angular velocity. The force of particle i on all walls, or on the walls of one solid, is
+G_ij is the kernel gradient. The factor is mu = -(V / d) sum_j x_j . G_j on the rest lattice. With this factor, a
+rigidly rotating fluid has a vorticity of twice its angular velocity. The force of particle i on all walls, or on the
+walls of one solid, is
 
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
-where s is the spacing and m_i s^d the mass of the particle. A_i is the sum over wall particles along which the pressure
-p_i acts (`ParticleSolver.wall_push`). a_i are accelerations of the particle by wall forces such as viscosity. B_i is
-the contribution of mirror images (`cortado.solvers.projection.mean_stress`). Walls gain the momentum that the fluid
-loses.
+where s is the spacing, m_i s^d the mass of the particle, and ``power`` the solver's ``density_power``. The pressure p_i
+acts along A_i, a sum over wall particles (`ParticleSolver.wall_push`). a_i are accelerations of the particle by wall
+forces such as viscosity. B_i is the contribution of mirror images (`cortado.solvers.projection.mean_stress`). Walls
+gain the momentum that the fluid loses.
 """
 
 from collections.abc import Callable
@@ -42,7 +43,7 @@ SIX = wp.types.vector(6, wp.float64)
 
 @dataclass(frozen=True)
 class Bars:
-    """Adjoints within a time step. The adjoints of quantities are added to them. See
+    """Adjoints of intermediate values of a time step. The adjoints of quantities are added to these arrays. See
     `cortado.solvers.solver.WithinBar`."""
 
     of: Adjoints
@@ -54,8 +55,8 @@ class Bars:
 
 
 class QuantityFormula(Protocol):
-    """Protocol of the formula of a quantity: (n,) values of sorted particles, or six numbers for each scene. ``p`` (n,)
-    are the pressures of particles on walls."""
+    """Protocol of the formula of a quantity. A quantity has a value for each sorted particle (n,), or six numbers for
+    each scene. ``p`` (n,) are the pressures of particles on walls."""
 
     def value(self, step: StepContext, p: Any) -> wp.array: ...
 
@@ -227,7 +228,8 @@ class Pressure:
 
 
 class WallLoads:
-    """The forces (n,) [N] of particles on the walls of solid number ``solid``, or of `ALL_WALLS`."""
+    """The forces (n,) [N] of particles on the walls of the solid with number ``solid``. With `ALL_WALLS`, the forces
+    are on all walls."""
 
     def __init__(self, solver: ParticleSolver):
         self._kernels, self.cell = wall_force_kernels(solver.discretisation), solver.lattice.cell

@@ -41,7 +41,7 @@ class Moment:
     """Parameters of the step by name, with a first axis for the scenes of a batch."""
     substeps: int
     row: int
-    """Number of the step in its run, from 0. For the last state it is the number of steps."""
+    """Number of the step in its run, from 0. For the last state, the number of steps of the run."""
     evaluator: "Evaluator"
     wanted: set[str] = field(default_factory=set)
     """Names of the quantities that were read so far. All moments of a run share this set."""
@@ -61,7 +61,8 @@ class Moment:
         return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
-        """Return a quantity of the state, a read-only float64 array. For a batch, the first axis counts the scenes."""
+        """Return a quantity of the state as a read-only float64 array. For a batch, the first axis counts the
+        scenes."""
         if name not in self._values:
             self.wanted.add(name)
             names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
@@ -206,7 +207,7 @@ class QuantityEvaluator:
         return wanted
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
-        """Find neighbours, and take the step if a quantity needs the pressure."""
+        """Find neighbours. If a quantity needs the pressure, also compute the step."""
         self._set(moment)
         if any(map(_needs_the_step, names)):
             return self._solve(replay)
@@ -265,7 +266,7 @@ class QuantityEvaluator:
         return self._by_scene(found[:, 2] if name == "vorticity" and self.dimension == 2 else found)
 
     def of_scene(self, name: str, values: NDArray) -> NDArray:
-        """Return a quantity in the order of the scene, or a load (6,)."""
+        """Return a quantity with the particles in the order of the scene, or a load (6,)."""
         found = values.astype(np.float64)
         found.flags.writeable = False
         return self._load(found) if is_load(name) else self._by_scene(found)

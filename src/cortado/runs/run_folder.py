@@ -51,8 +51,8 @@ class _Entry:
 class RunFolder:
     """The folder and files of one run.
 
-    The file environment.json marks a run folder. It is written first and removed last, so that the folder of a killed
-    process can be overwritten or resumed.
+    The file environment.json marks a run folder. The file is written first and removed last, so that the folder of a
+    killed process can be overwritten or resumed.
     """
 
     path: Path
@@ -79,9 +79,9 @@ class RunFolder:
         device: str = "",
         overwrite: bool = False,
     ) -> Self:
-        """Make the folder of a new run. ``kind`` is the name of the command, and ``settings`` are its settings; a
-        resumed run must have the same kind and settings. ``device`` is a description. ``overwrite`` removes the files
-        of an earlier run.
+        """Make the folder of a new run. ``kind`` is the name of the command, and ``settings`` are its settings. A
+        resumed run must have the same kind and settings. ``device`` is a description of the device. ``overwrite``
+        removes the files of an earlier run.
 
         Raises `InputError` if the folder is not writable, or contains a run or other files that the run would replace.
         Raises `ComputationError` if the disk is full.
@@ -299,7 +299,8 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
-    """Return pairs of different values by dotted name. ``missing`` replaces an absent value."""
+    """Return the values that differ between ``one`` and ``other``, as pairs by dotted name. ``missing`` replaces an
+    absent value."""
     are_lists = all(isinstance(own, list) and any(isinstance(e, Mapping) for e in own) for own in (one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}

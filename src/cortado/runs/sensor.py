@@ -60,7 +60,7 @@ class Sensor(Protocol):
 
 
 def named(what: str, name: Any, of: str) -> str:
-    """Return the name of an object. Raises `InputError` unless it is a text."""
+    """Return the name of an object. Raises `InputError` unless the name is a string."""
     if not isinstance(name, str) or not name:
         raise InputError(f"{what} is {shown(name)}, but must be the name of a {of}.")
     return name
@@ -118,7 +118,7 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
 
 
 def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
-    """Return the reading (k,) of a sensor. Raises `InputError` unless it has one number for each column."""
+    """Return the reading (k,) of a sensor. Raises `InputError` unless the reading has one number for each column."""
     what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
     found = as_numbers(what, sensor.value(at))
     if found.shape != (columns,):

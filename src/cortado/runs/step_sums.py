@@ -282,8 +282,8 @@ class ChunkSums:
         self._carried = None if ride is None or point is None else CarriedRows(ride, point, scene, solver, rows)
 
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
-        """Launch the sums for the states before ``count`` steps, and return an array of sums for each state
-        and scene."""
+        """Launch the sums for the states before each of ``count`` steps. Return an array with a sum for each state and
+        scene."""
         if isinstance(self._summed, LoadSum):
             return self._total if self._summed.quantity is None else kept[self._summed.quantity]
         key = count, first.positions.ptr

@@ -121,7 +121,7 @@ class Trajectory:
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Recorded quantities by name, such as ``density``, (frames, n) or (frames, n, k)."""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
-    """Readings of sensors in every step, by sensor name. Files do not contain them."""
+    """Readings of sensors in every step, by sensor name. Trajectory files do not contain the readings."""
     solids: SolidMotions = field(default_factory=SolidMotions)
     """Motions of moving solids by name."""
     begun: int | None = None
@@ -180,9 +180,9 @@ class Trajectory:
         return Frame(self.positions[place], self.velocities[place], fractions, float(self.times[place]), own, others)
 
     def quantity(self, name: str) -> NDArray[Any]:
-        """Return by ``name`` a recorded quantity of the particles or the speed, (frames, n) or (frames, n, k), or a
-        field (frames, ...) of the states; raise `InputError` for any other name. `Simulation.quantity` computes
-        others."""
+        """Return a recorded quantity of the particles or the speed by ``name``, (frames, n) or (frames, n, k). A field
+        of the states may also be named, (frames, ...). Raises `InputError` for any other name. `Simulation.quantity`
+        computes quantities that were not recorded."""
         return chosen(self.quantities, name, fields_of(self))
 
     def __iter__(self) -> Iterator[Frame]:
@@ -190,7 +190,7 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """Return the times (frames,) [s] of the frames in films. For a run with ``--fps`` they are the due times, and
+        """Return the times (frames,) [s] of the frames in films. For a run with ``--fps`` the result is the due times,
         otherwise ``times``."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
@@ -226,8 +226,8 @@ class Trajectory:
 
     @property
     def last_state(self) -> RestartState:
-        """Return a copy of the last state. A run that `Simulation.run` continues from this state has exactly the
-        numbers of a run without interruption. Raises `InputError` if there is no frame."""
+        """Return a copy of the last state. If `Simulation.run` continues from this state, the results are exactly those
+        of a run without interruption. Raises `InputError` if there is no frame."""
         if not len(self):
             raise InputError("The trajectory has no frame, but must have one to continue from.")
         own = {name: array.copy() for name, array in {**fields_of(self[-1]), **self.constants}.items()}
@@ -285,7 +285,7 @@ class Trajectory:
     def picture(
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
-        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1. A notebook displays it.
+        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1. A notebook displays the picture.
 
         The camera is placed so that the fluid is visible in every frame. The arguments ``scene``, ``device`` and
         ``settings``, and the errors, are as in `film`.
@@ -321,8 +321,9 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read the file at ``path`` that `save` or `TrajectoryWriter` wrote; its writer may be running or killed. Raise
-        `InputError` if the file is missing, damaged, or none of Cortado's trajectories."""
+        """Read the file at ``path``, written by `save` or `TrajectoryWriter`. The process that writes the file may
+        still be running, or may have been killed. Raises `InputError` if the file is missing, damaged, or not a
+        trajectory of Cortado."""
         arrays = vtkhdf.read(as_path("path", path))
         names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)

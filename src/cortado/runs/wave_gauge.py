@@ -5,11 +5,12 @@ signed distance phi from a solid, the solid occupies the fraction
 
     s_c = min(max(1/2 - phi(x_c) / step, 0), 1)
 
-where step is the distance between points. A flat solid therefore occupies exactly its height. Fractions of several
-solids add up to at most 1. Level k has the free fraction 1 - sum_c w_c s_c, and the fluid fills the levels from below.
+where step is the distance between points. The part of the column that a flat solid occupies is therefore exact.
+Fractions of several solids add up to at most 1. Level k has the free fraction 1 - sum_c w_c s_c, and the fluid fills
+the levels from below.
 
-Above a solid with fluid below it, such as a boat, the height would jump as a function of the depth. The jump is
-replaced by a slope over a depth of `FILM`, so that slightly compressed fluid does not appear on a deck.
+Above a solid with fluid below it, such as a boat, the height would jump as a function of the depth. A slope over a
+depth of `FILM` replaces the jump, so that slightly compressed fluid does not appear on a deck.
 """
 
 from dataclasses import dataclass, replace
@@ -124,7 +125,7 @@ class Column:
     weights: NDArray[Any]
     """Weights of points (c,). The weights inside the container add up to 1."""
     outside: NDArray[Any]
-    """Fraction outside the container of the cell around each point (c,)."""
+    """Fraction of the cell around each point that is outside the container (c,)."""
     solids: list[tuple[Standing, NDArray[Any]]]
     """Solids in the column, with the distances of the points from the solid (levels, c) [m]."""
 
@@ -175,7 +176,8 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """Return the height [m] of fluid whose ``depth`` without solids is given [m], and its derivatives.
+        """Return the height [m] of the surface, and its derivatives. ``depth`` [m] is the depth that the fluid would
+        have without solids.
 
         The first derivative is with respect to the volume of solids in each level (levels,). The second derivative is
         with respect to ``depth``.
@@ -232,8 +234,8 @@ def column_of(axis: Axis, at: Reading, container: Container) -> Column | None:
 
 @lru_cache(maxsize=64)
 def cut_by(axis: Axis, container: Container) -> NDArray[Any] | None:
-    """Return the fraction (c,) inside the container of the cell around each point. Return None if all cells are inside,
-    or if the sides of the container are not parallel to the column."""
+    """Return the fraction (c,) of the cell around each point that is inside the container. Return None if all cells are
+    inside, or if the sides of the container are not parallel to the column."""
     up, foot = np.array(axis.up), np.array(axis.foot)
     region, periods = container.region(len(up)), container.periods(len(up))[1]
     along = np.abs(up) > 1.0 - 1e-12
@@ -259,14 +261,14 @@ class WaveGauge(Summed):
     """A sensor of the height h of the fluid's surface at a place.
 
     The height is the level up to which the fluid in a column around the place would fill the column from its floor.
-    Without solids it is
+    Without solids the height is
 
     h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1.
 
     Here r_i is the horizontal distance of particle i, V = spacing^d its volume, and w a smooth function. Solids occupy
     part of the column. The height is also correct above a solid on the floor, within the fluid or piercing its surface.
-    Fluid in the air counts as if it lay on the fluid below, also on a solid with air below. The column ends at sides of
-    the container that are parallel to ``up``.
+    Fluid in the air counts as if it lay on the fluid below. Fluid on a solid with air below counts in the same way. The
+    column ends at sides of the container that are parallel to ``up``.
 
     Example::
 
@@ -283,13 +285,14 @@ class WaveGauge(Summed):
         on: str | None = None,
         axes: Axes = "world",
     ):
-        """Place a gauge at ``position`` (d,) [m]. Its component along ``up`` has no effect. ``floor`` is the coordinate
-        of the column's bottom along ``up`` [m]. ``up`` (d,) is by default the y axis. ``radius`` [m] is the radius of
-        the column. By default it is two support radii of the smoothing kernel or five spacings, whichever is larger.
+        """Place a gauge at ``position`` (d,) [m]. The component of ``position`` along ``up`` has no effect. ``floor``
+        is the coordinate of the column's bottom along ``up`` [m]. ``up`` (d,) is by default the y axis. ``radius`` [m]
+        is the radius of the column. The default radius is two support radii of the smoothing kernel or five spacings,
+        whichever is larger.
 
         ``on`` names a solid that carries the bottom of the column. With ``axes`` "body" the column rotates with the
-        solid, and the height is measured along the axes of the solid. With "world" it is measured along ``up``. Sides
-        of the container do not bound a column on a solid.
+        solid, and the height is measured along the axes of the solid. With "world" the height is measured along ``up``.
+        Sides of the container do not bound a column on a solid.
         """
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)

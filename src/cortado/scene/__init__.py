@@ -1,4 +1,4 @@
-"""Scenes of the user: tables, parameters and particles."""
+"""Scenes: their tables, parameters and particles."""
 
 from typing import TYPE_CHECKING
 

@@ -35,7 +35,7 @@ class Liquid:
     """Optical properties of a fluid in pictures. Light in fluid follows the Beer-Lambert law."""
 
     colour: Numbers
-    """Colour of scattered light. White light also has this colour after the length 1 / absorption."""
+    """Colour of scattered light. Over the length 1 / absorption, absorption also gives white light this colour."""
     scattering: float
     """Scattering coefficient [1/m]. Over a length L the fraction exp(-scattering L) of the light is not scattered."""
     absorption: float
@@ -64,7 +64,8 @@ FINISHES = {
 
 
 class Coloured(Table):
-    """A table with a colour. The default is the colour of its material, or ``plain`` without a material."""
+    """Base of tables with a colour. The default colour is the colour of the table's material, or ``plain`` without a
+    material."""
 
     materials: ClassVar[Mapping[str, Any]]
     plain: ClassVar[Numbers]
@@ -87,18 +88,18 @@ class Light:
     """Light of a picture: the sun, the sky, and a weak strip of light opposite the sun."""
 
     azimuth: float
-    """Angle of the sun to the right of the camera's initial direction [degrees]."""
+    """Horizontal angle of the sun to the right of the camera's initial viewing direction [degrees]."""
     elevation: float
     """Angle of the sun above the floor [degrees]."""
     lamp: Numbers
     strip: Numbers
     sunlight: Numbers
-    """Light of the sun on a surface that faces it."""
+    """Brightness (3,) of sunlight on a white surface that faces the sun: red, green and blue."""
     shadow: float
-    """Fraction of the light on the floor from the sun."""
+    """Fraction of the light on the floor that comes from the sun."""
     background: Numbers
     zenith: Numbers
-    """Colour of the sky overhead, relative to the horizon."""
+    """Colour of the sky overhead, divided by its colour at the horizon."""
 
 
 LIGHTS = {  # in the order of the keys of `Light`
@@ -127,32 +128,33 @@ class View:
 
 @dataclass(frozen=True)
 class Moment:
-    """A moment of a film, with the time and the solids of the run."""
+    """One moment of a film: its time in the run, and the positions of the solids."""
 
     share: float
     """Elapsed fraction of the film, from 0 to 1."""
     time: float
     """Time of the run [s]."""
     up: Points
-    """Unit vector against gravity (3,)."""
+    """Unit vector (3,) opposite to gravity."""
     solids: Mapping[str, NDArray]
-    """Current centre of each solid by name (3,) [m]."""
+    """Current centre (3,) [m] of each solid, by the solid's name."""
 
 
 class CameraPath(Table):
-    """A path of a moving camera."""
+    """Base of the paths of a moving camera."""
 
     goes_around: ClassVar[bool] = False
-    """True if the camera sees the scene from all sides."""
+    """True if the camera sees the scene from all sides along its path."""
     kind: str
-    """Name of the path."""
+    """Name of the kind of path."""
 
     def view(self, home: View, moment: Moment) -> View:
-        """Return the view at a moment. ``home`` is the view of a camera at rest."""
+        """Return the view of the camera at a moment of the film. ``home`` is the view of a camera at rest."""
         raise NotImplementedError
 
     def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
-        """Raise a `field_error` at ``path`` if the table names an unknown solid. ``names`` are the known solids."""
+        """Raise a `field_error` at ``path`` if the camera path refers to an unknown solid. ``names`` are the names of
+        the scene's solids."""
 
 
 @public
@@ -161,7 +163,7 @@ class Orbit(CameraPath):
 
     goes_around: ClassVar[bool] = True
     kind: Literal["orbit"] = "orbit"
-    """Name of the path."""
+    """Name of the kind of path."""
     turns: Annotated[float, quantity(ge=-100.0, le=100.0)] = 1.0
     """Number of turns during the film. Seen from above, positive turns are counterclockwise."""
 
@@ -174,12 +176,12 @@ class Orbit(CameraPath):
 
 @public
 class Dolly(CameraPath):
-    """A straight camera path towards the middle of the picture, or away from it, with a gentle start and end."""
+    """A straight camera path towards the middle of the picture, or away from it. The camera starts and stops gently."""
 
     kind: Literal["dolly"] = "dolly"
-    """Name of the path."""
+    """Name of the kind of path."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
-    """Distance at the end of the film, as a multiple of the distance at the start."""
+    """Final distance of the camera from the middle of the picture, as a multiple of the initial distance."""
 
     def view(self, home: View, moment: Moment) -> View:
         factor = self.distance ** (moment.share * moment.share * (3.0 - 2.0 * moment.share))
@@ -188,16 +190,16 @@ class Dolly(CameraPath):
 
 @public
 class Keyframes(CameraPath):
-    """A smooth camera path through given places at given times of the run."""
+    """A smooth camera path through given positions at given times of the run."""
 
     kind: Literal["keyframes"] = "keyframes"
-    """Name of the path."""
+    """Name of the kind of path."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...]
-    """(k,) Increasing times of the run [s]. The camera rests before the first and after the last time."""
+    """(k,) Times of the run, increasing [s]. The camera rests before the first and after the last time."""
     cameras: tuple[tuple[Length, ...], ...]
-    """(k, 3) Positions of the camera at the given times [m]."""
+    """(k, 3) Positions of the camera at `times` [m]."""
     look_at: tuple[tuple[Length, ...], ...] | None = None
-    """(k, 3) Points in the middle of the picture at the given times [m]; if left out, the point of a camera at rest."""
+    """(k, 3) Points in the middle of the picture at `times` [m]; if left out, the camera looks at one fixed point."""
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -225,11 +227,11 @@ class Follow(CameraPath):
     """A camera path that moves with a solid and looks at its centre from a fixed direction and distance."""
 
     kind: Literal["follow"] = "follow"
-    """Name of the path."""
+    """Name of the kind of path."""
     solid: Text
-    """Name of the solid."""
+    """Name of the solid that the camera follows."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 1.0
-    """Distance of the camera from the solid, as a multiple of the distance of a camera at rest."""
+    """Distance of the camera from the solid, as a multiple of the viewing distance of a camera at rest."""
 
     def view(self, home: View, moment: Moment) -> View:
         middle = np.asarray(moment.solids[self.solid])
@@ -247,13 +249,13 @@ Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
 class Picture(Table):
-    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Suitable values replace
-    keys that are left out."""
+    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Keys that are left out get
+    suitable values."""
 
     width: Annotated[int, count(64, 7680)] = 1280
-    """Columns of pixels."""
+    """Width of the picture in pixels."""
     height: Annotated[int, count(64, 4320)] = 720
-    """Rows of pixels."""
+    """Height of the picture in pixels."""
     surface: Literal["liquid", "spheres"] = "liquid"
     """"liquid" draws the surface of the fluid; "spheres" draws a sphere for each particle, in 3-D."""
     quality: Literal["traced", "quick"] | None = None
@@ -263,8 +265,7 @@ class Picture(Table):
     camera: Place | None = None
     """(3,) Position of the camera [m], in 3-D; if left out, the camera sees the whole container."""
     camera_path: AnyCameraPath | None = None
-    """Path of the camera during a run, in films and in single pictures, in 3-D. If left out, the camera stays
-    in place."""
+    """Path of the camera during a run, for films and single pictures in 3-D. If left out, the camera stays in place."""
     look_at: Place | None = None
     """(3,) Point in the middle of the picture [m], in 3-D; if left out, the middle of the container."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=120.0)] = 28.0
@@ -281,15 +282,15 @@ class Picture(Table):
     light."""
     colour: Annotated[str, OneOf(COLOURS)] = "phase"
     """Colours of particles: "phase" for the colours of the phases, or the name of a quantity on a colour scale. "age"
-    is the time since a particle left an emitter or since the start."""
+    is the time since a particle left an emitter, or since the start of the run."""
     shaded: Flag = True
-    """Whether the fluid is drawn with light and shadow. If false, fluid has exactly the colours of the scale."""
+    """Whether the fluid is drawn with light and shadow. If false, fluid has exactly the colours of the colour scale."""
     film_frames: Annotated[int, count(0, 1_000_000)] | None = None
     """Number of frames of a film, evenly chosen from the recorded states. If left out, a film has 25 frames per second.
     With 0 no film is made. A search records this number of states for its films, by default 121."""
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
     """Simulated seconds per second of the film; 1 is real time. If left out, the film runs in real time, or at a speed
-    that makes the film 4 to 10 s long."""
+    for a length of 4 to 10 s."""
 
     @property
     def sun_and_sky(self) -> Light:
@@ -329,21 +330,21 @@ class Render(Table):
     """The view and the camera of a differentiable picture."""
 
     view: Literal["top", "volume", "plane"] = "top"
-    """"top" looks from above, "volume" looks through a camera, and "plane", the default in 2-D, shows the plane."""
+    """"top" looks from above, "volume" looks through a camera, and "plane" shows a plane (default in 2-D)."""
     resolution: Pixels = (128, 128)
-    """(2,) Columns and rows of pixels."""
+    """(2,) Width and height of the picture in pixels."""
     background: Colour = (1.0, 1.0, 1.0)
     """(3,) Background colour: red, green and blue, each from 0 to 1."""
     extinction: Annotated[float, quantity("1/m", gt=0.0)] | None = None
-    """Extinction of light in fluid [1/m]; if left out, the renderer chooses a value."""
+    """Extinction coefficient of the fluid [1/m]; if left out, the renderer chooses a value."""
     position: Place | None = Field(default=None, validate_default=True)
-    """(3,) Position of the camera [m]; required for a view of the volume."""
+    """(3,) Position of the camera [m]; required for the view "volume"."""
     look_at: Place | None = Field(default=None, validate_default=True)
-    """(3,) Point in the middle of the picture [m]; required for a view of the volume."""
+    """(3,) Point in the middle of the picture [m]; required for the view "volume"."""
     field_of_view: Annotated[float, quantity("degrees", gt=0.0, le=170.0)] | None = Field(
         default=None, validate_default=True
     )
-    """Horizontal angle of view [degrees], for a view of the volume; 40 if left out."""
+    """Horizontal angle of view [degrees], for the view "volume"; 40 if left out."""
 
     @field_validator("position", "look_at", "field_of_view")
     @classmethod

@@ -1,4 +1,4 @@
-"""Checks of the names, sizes and fluid of a scene. A failed check raises a `field_error`."""
+"""Checks of names, sizes and bodies of fluid in a scene. A failed check raises a `field_error`."""
 
 from itertools import product
 from typing import Any
@@ -85,9 +85,9 @@ NEAREST = 0.5
 """Smallest initial distance between particles [spacings]."""
 OVERLAPPING = NEAREST * (1.0 - 1e-6)
 DENSEST = 0.9
-"""Greatest relative number density of a point outside a body of fluid."""
+"""Greatest relative number density of one body of fluid at a particle of another body."""
 SUPPORT, NEIGHBOURS = 2.0, 40
-"""Support radius for number densities [spacings], and greatest number of neighbours."""
+"""Support radius for number densities [spacings], and greatest number of neighbours in the sum."""
 
 
 def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
@@ -105,8 +105,8 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
 
 
 def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
-    """Check that bodies of fluid do not overlap. Periodic images are included: ``lengths`` (d,) are the lengths of the
-    periodic box [m]."""
+    """Check that bodies of fluid do not overlap, with their periodic images included. ``lengths`` (d,) [m] are the
+    lengths of the periodic box."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
@@ -279,7 +279,6 @@ def _check_near(path: FieldPath, ends: Any, spacing: float) -> None:
 
 
 def _check_inside(scene: SceneTables, index: int, fluid: Fluid) -> None:
-    """Check that a body of fluid is inside the container."""
     spacing = scene.discretisation.spacing
     tolerance, (lower, upper) = 1e-6 * spacing, fluid.extent(spacing)
     if scene.container.contains(corners(lower, upper), tolerance).all():

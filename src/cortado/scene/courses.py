@@ -1,4 +1,4 @@
-"""Quantities over time, from constants, lists or CSV files."""
+"""Quantities that change over time, from constants, lists or CSV files."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,36 +22,36 @@ RAMP_PARTS = 16
 @dataclass(frozen=True, eq=False)
 class Steady:
     rate: NDArray[np.float64]
-    """Change per second, () or (components,)."""
+    """Rate of change per second, a number or an array (components,)."""
 
     def at(self, times: NDArray) -> NDArray:
-        """Return values (n,) or (n, components) at times (n,) [s]."""
+        """Return the values (n,) or (n, components) of the quantity at ``times`` (n,) [s]."""
         return np.multiply.outer(times, self.rate)
 
     def greatest(self) -> float:
         return float(np.linalg.norm(self.rate))
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return time derivatives, (n,) or (n, components), at times (n,) [s]."""
+        """Return the time derivatives (n,) or (n, components) of the quantity at ``times`` (n,) [s]."""
         return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
 
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Values that are interpolated between given times, linearly or by a cubic spline with zero slope at both ends. The
-    values are constant before the first and after the last time.
+    """A curve through given values at given times. Values between the times are interpolated linearly, or by a cubic
+    spline with zero slope at both ends. The curve is constant before the first and after the last time.
 
-    A ramp makes the values grow smoothly from ``begun``. The difference from ``begun`` is multiplied by 10 s³ - 15 s⁴ +
-    6 s⁵, where s = min(t / ramp, 1) and t is the time.
+    A ramp makes the curve start smoothly from the value ``begun``. The difference between curve and ``begun`` is
+    multiplied by 10 s³ - 15 s⁴ + 6 s⁵. Here s = min(t / ramp, 1), and t is the time.
     """
 
     times: NDArray[np.float64]
-    """Times (k,) [s]."""
+    """Times of the given values (k,) [s]."""
     values: NDArray[np.float64]
-    """Values at `times`, (k,) or (k, components)."""
+    """Values of the curve at `times`, (k,) or (k, components)."""
     interpolation: Interpolation = "linear"
     ramp: float = 0.0
-    """Duration of the ramp from time 0 [s]; 0 without a ramp."""
+    """Duration of the ramp, which begins at time 0 [s]; 0 for no ramp."""
     begun: Any = 0.0
 
     def at(self, times: NDArray) -> NDArray:
@@ -59,8 +59,8 @@ class Knots:
         return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return time derivatives, (n,) or (n, components), at times (n,) [s]. At a kink, return the derivative after
-        the kink."""
+        """Return the time derivatives of the curve, (n,) or (n, components), at ``times`` (n,) [s]. At a kink, return
+        the derivative just after the kink."""
         if self.interpolation == "spline" and len(self.times) > 1:
             found = np.asarray(self._spline(times, 1)).T
             found = np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
@@ -78,13 +78,13 @@ class Knots:
 
     @cached_property
     def breaks(self) -> NDArray[np.float64]:
-        """Times (m,) [s] between which the curve is smooth."""
+        """Times (m,) [s] at which the curve may have kinks. Between these times the curve is smooth."""
         along = np.linspace(0.0, self.ramp, RAMP_PARTS + 1) if self.ramp else self.times[:1]
         return np.unique(np.concatenate([self.times, along]))
 
     @property
     def seen(self) -> NDArray[np.float64]:
-        """Values of the curve, (m,) or (m, components), that cover its range."""
+        """Samples of the curve, (m,) or (m, components), which cover the range of its values."""
         straight = self.interpolation == "linear" and not self.ramp
         return self.values if straight else self.at(np.append(_within(self.breaks).ravel(), self.breaks[-1]))
 
@@ -102,14 +102,15 @@ class Knots:
         return found.reshape(len(times), *self.values.shape[1:])
 
     def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the factor of the ramp and its time derivative [1/s]."""
+        """Return the factor of the ramp at ``times``, and its time derivative [1/s]."""
         s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * (s * (1.0 - s)) ** 2 / self.ramp
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
-    """Return the greatest speed within each interval between the ``times`` (k,) [s]. The speed is the sum of the rates
-    of the curves ``moved``, each multiplied by its factor."""
+    """Return the greatest speed within each interval between the ``times`` (k,) [s]. ``moved`` are pairs of a factor
+    and a curve. The speed is the sum over all curves of the factor times the magnitude of the curve's time derivative.
+    """
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     return np.append(sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1), 0.0)
@@ -130,22 +131,23 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0},
     "m/s2": {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "g": 9.80665},
 }
-"""Factors from the units of a file to the unit of a scene."""
+"""Conversion factors by scene unit and by unit in the file."""
 MOST_BYTES = 2**25
-"""Greatest size of a file [byte]."""
+"""Greatest size of a CSV file [byte]."""
 Columns = tuple[tuple[str, str], ...]
-"""Pairs of a column's name and its unit."""
+"""For each column of a file, its name and its unit in the scene."""
 
 
 @cached_by_file(8, MOST_BYTES)
 def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArray, dict[str, NDArray]]:
-    """Return the times (k,) [s] of a CSV file and its columns (k,) in the units of a scene.
+    """Return the times (k,) [s] in a CSV file, and its other columns (k,) by name. Values are converted to the units of
+    a scene.
 
-    Raises `InputError` with the file, the column, the value found and the allowed values.
+    Raises `InputError` with the file, the column, the invalid value and the allowed values.
 
     Args:
-        file: a header of names with units, such as ``time [s],x [mm],rotation [deg]``, then lines of numbers at
-            increasing times.
+        file: path of the file. Its header has names with units, such as ``time [s],x [mm],rotation [deg]``. The lines
+            below the header have numbers, with increasing times.
         columns: allowed columns besides the time.
         needs_all: True if the file must have all of ``columns``, False if one column is enough.
     """
@@ -181,8 +183,8 @@ def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArra
 
 
 def lists_in_file(table: Any, path: FieldPath, columns: Columns, what: str, needs_all: bool) -> dict[str, Any]:
-    """Return the times and columns that a table's file contains, as values of keys such as ``times`` and ``torques``.
-    Raise a `field_error` for an invalid file."""
+    """Return the lists in a table's CSV file, by the keys of the table, such as ``times`` and ``torques``. Raise a
+    `field_error` for an invalid file."""
     names = [name for name, _ in columns]
     for key in (*names, "times", *(f"{name}s" for name in names)):
         if (found := getattr(table, key)) is not None:
@@ -200,7 +202,7 @@ Rows = NDArray[np.float64]
 
 
 def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None] | None:
-    """Return the times (k,) [s] of a solid's path, its displacements (k, d) [m] and its rotations (k, 1) or (k, 3)
+    """Return the prescribed path of a solid: times (k,) [s], displacements (k, d) [m], and rotations (k, 1) or (k, 3)
     [rad]. Return None for a solid without a path. Raises `InputError` for an invalid file."""
     if solid.path is None:
         if solid.times is None:
@@ -322,8 +324,8 @@ def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
 
 
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check that the ``times`` of a table increase from 0 and that there is a value for each time. ``values`` is the
-    key of the values. The table must not also have the key ``constant``."""
+    """Check that the key ``times`` of a table increases from 0, and that there is a value for each time. ``values`` is
+    the name of the key with the values. The table must not also have the key named by ``constant``."""
     _check_times(path, table.times)
     given, wanted = getattr(table, values), f"a list of {len(table.times)}, as are times"
     if given is None or len(given) != len(table.times):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 WHOLE = 1e-6
 """Greatest relative gap between a solid and its periodic image that counts as closed."""
 OFF_SHEETS = 0.25
-"""Smallest initial distance of fluid from a sheet [spacings]."""
+"""Smallest initial distance between fluid particles and a sheet [spacings]."""
 NEAREST_PLACE = 0.4
 """Smallest distance from surfaces of the points at which weights of wall particles are fitted [spacings]."""
 
@@ -41,17 +41,17 @@ NEAREST_PLACE = 0.4
 @dataclass(frozen=True)
 class Walls(Rows):
     positions: Points
-    """Initial positions (b, d) [m]."""
+    """Initial positions of the wall particles (b, d) [m]."""
     weights: Points
-    """Weights of wall particles in the density, relative to a fluid particle (b,)."""
+    """Weights of the wall particles in density sums (b,). A fluid particle has the weight 1."""
     feet: Points
-    """Vectors from wall particles to their nearest points on the surface (b, d) [m]."""
+    """Vectors from the wall particles to the nearest points on the wall's surface (b, d) [m]."""
     sticks: NDArray[np.bool_]
-    """True for no-slip walls (b,)."""
+    """True for particles of no-slip walls (b,)."""
     slides: Points
-    """Velocity of the sliding surface in the frame of the solid (b, d) [m/s]."""
+    """Velocity of a surface that slides like a conveyor belt (b, d) [m/s], relative to its solid."""
     solid: NDArray[np.int64]
-    """Number of the solid from `wall_numbers` (b,); -1 for the container."""
+    """Number of each wall particle's solid (b,), from `wall_numbers`. The number of the container is -1."""
 
     @classmethod
     def of(cls, points: WallPoints, weights: Points, sticks: bool | NDArray[np.bool_]) -> "Walls":
@@ -60,7 +60,7 @@ class Walls(Rows):
 
 
 def walls_of(scene: Scene, lattice: RestLattice) -> Walls:
-    """Build the wall particles of a scene. Raise `InputError` for a solid without contact to fluid."""
+    """Build the wall particles of a scene. Raise `InputError` for a solid that cannot touch fluid."""
     even = _even_points(scene.container, lattice)
     solids = scene.container.solids(scene.dimension, lattice.support)
     container = ContainerWalls(even, solids, scene.resting_room, lattice.spacing, lattice.support)
@@ -104,7 +104,7 @@ def _even_points(container: Container, lattice: RestLattice) -> WallPoints:
 
 
 def _around(scene: Scene, container: ContainerWalls, kept: Walls, lattice: RestLattice) -> Walls:
-    """Build the wall particles of solids at rest and of the container near these solids."""
+    """Build the wall particles of solids at rest, and of the nearby container walls."""
     room, (lower, _) = container.room, scene.periods
     resting = [solid for solid in thick(scene.solid) if not solid.moves]
     images = [room.images(solid) for solid in room.solids]
@@ -125,7 +125,6 @@ def _around(scene: Scene, container: ContainerWalls, kept: Walls, lattice: RestL
 
 
 def _alone(table: SolidTable, number: int, periods: Points, lattice: RestLattice) -> Walls:
-    """Build the wall particles of a moving solid."""
     dimension, turn = len(periods), table.turn(len(periods))
     lower, upper = table.solid().extent()
     filled = np.where(upper - lower > periods * (1.0 - WHOLE), periods, 0.0)
@@ -177,8 +176,8 @@ def _weighed(surface: ExposedSurface, beside: Places, kept: Walls, lattice: Rest
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Return the coordinates of the flat walls that mirror the fluid: lower walls (3,) and upper walls (3,) [m]. A
-    coordinate is infinite if there is no wall."""
+    """Return the positions of the flat walls that mirror the fluid: lower walls (3,) [m] and upper walls (3,) [m]. The
+    position is infinite if an axis has no such wall."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -196,13 +195,13 @@ class Lattice:
     self_weight: float
     """Value W(0) of the smoothing kernel [1 / m^d]."""
     volume: float
-    """Volume of a particle for which the lattice has the rest density [m^d]."""
+    """Volume of one particle [m^d]. With this volume, fluid on the lattice has the rest density."""
     cell: float
     """Volume of a lattice cell [m^d]."""
     stiffness: float
-    """Stiffness of PCISPH, without the division by the square of the time step [m2] (Solenthaler and Pajarola 2009)."""
+    """Stiffness of the solver PCISPH times the square of the time step [m2] (Solenthaler and Pajarola 2009)."""
     response: float
-    """Sum of squared kernel gradients over the neighbours of a particle [1 / m^(2 d + 2)]."""
+    """Sum of the squared kernel gradients from all neighbours of a particle [1 / m^(2 d + 2)]."""
     laplacian_correction: float
     domain: Domain
 
@@ -241,7 +240,7 @@ class DiscreteScene:
 def discretise(scene: Scene) -> DiscreteScene:
     """Discretise a scene into particles. Warns if the mass of the fluid differs from the prescribed mass.
 
-    Raises `InputError` if a file of points no longer exists, or if its points are too close together.
+    Raises `InputError` if a file of particle positions no longer exists, or if its positions are too close together.
     """
     kernel, dimension = smoothing_kernel(scene.discretisation.kernel), scene.dimension
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
@@ -270,7 +269,7 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _settled(scene: Scene, fluid: FluidSample, walls: Walls, lattice: RestLattice) -> FluidSample:
-    """Return the fluid after packing, at least `OFF_SHEETS` spacings from sheets."""
+    """Return the fluid after packing. Each particle is at least `OFF_SHEETS` spacings from sheets."""
     if fluid.bodies:
         stays, (lower, lengths) = ~fluid.is_packed, scene.periods
         air, shares = air_around(fluid.bodies, fluid.positions[stays], lower, lengths, lattice.support)
@@ -288,7 +287,7 @@ def _settled(scene: Scene, fluid: FluidSample, walls: Walls, lattice: RestLattic
 
 
 def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:
-    """Raise `InputError` if a scene is too far from the origin for the precision of positions."""
+    """Raise `InputError` if a scene is so far from the origin that ``precision`` cannot resolve its positions."""
     spacing = scene.discretisation.spacing
     furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
     if furthest > precision.furthest:

@@ -15,8 +15,8 @@ from cortado.scene.shape_tables import File, Ordered
 from cortado.scene.tables import MISSING, Direction, FieldPath, Length, Table, Text, Vector, field_error, quantity
 
 PRESCRIBED, BLENDED = 3.0, 3.0
-"""Thicknesses of the two shells around a sink: the inner shell has a prescribed flow, the outer shell a transition
-[spacings]."""
+"""Thicknesses of two shells around a sink [spacings]. The flow is prescribed in the inner shell and changes smoothly in
+the outer shell."""
 
 
 class BoxDrain(Ordered):
@@ -27,27 +27,29 @@ class BoxDrain(Ordered):
     name: Text
     """Name of the drain."""
     lower: Vector[Length] | None = None
-    """(d,) Lower corner of the box [m]; if left out, the box has no lower end."""
+    """(d,) Lower corner of the box [m]; if left out, the box has no lower limit."""
     upper: Vector[Length] | None = None
-    """(d,) Upper corner of the box [m]; if left out, the box has no upper end."""
+    """(d,) Upper corner of the box [m]; if left out, the box has no upper limit."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         self.check_components(("lower", "upper"), dimension, path)
         return super().in_dimension(dimension, path)
 
     def ends(self, dimension: int) -> Points:
-        """Return the lower and the upper corner (2, d) [m]. A coordinate is infinite if the box has no end there."""
+        """Return the lower and the upper corner of the box (2, d) [m]. A coordinate is infinite where the box has no
+        limit."""
         none = np.full(dimension, np.inf)
         return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
 
     def middle(self, dimension: int) -> Points:
-        """Return the middle of the box (d,) [m]. Along an axis with only one end, return the coordinate of the end."""
+        """Return the middle of the box (d,) [m]. Along an axis with only one limit, return the coordinate of this
+        limit."""
         ends = self.ends(dimension)
         return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
 
 
 class PlaneDrain(Table):
-    """A plane that removes every particle which crosses it along `direction`."""
+    """A plane that removes particles. A particle is removed when it crosses the plane along `direction`."""
 
     shape: Literal["plane"]
     """Kind of the drain."""
@@ -63,18 +65,18 @@ class PlaneDrain(Table):
 
 
 flow_name = ending("flow_rate")
-"""Parameter: flow rate of an emitter or a sink."""
+"""Name of a parameter: flow rate of an emitter or a sink."""
 count_name = ending("count")
-"""Field: number of particles that a drain has removed."""
+"""Name of a state field: number of particles that a drain has removed."""
 
 
 class FlowTable(Table):
-    """A flow rate: a constant, a table over time, or a file."""
+    """A table with a flow rate, which is a constant, a list of values over time, or a CSV file."""
 
     name: Text
     """Name of the emitter or sink."""
     flow_rate: Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)] | None = None
-    """Volume per second [m3/s], in 2-D area per second [m2/s]."""
+    """Flow rate: volume per second [m3/s], in 2-D area per second [m2/s]."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
     """(k,) Times of `flow_rates`, increasing from 0 [s]. Flow rates are interpolated linearly between the times."""
     flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
@@ -98,7 +100,7 @@ class FlowTable(Table):
 
     @property
     def course(self) -> Knots | None:
-        """Return the flow rate over time, or None if it is constant."""
+        """Return the curve of the flow rate over time, or None for a constant flow rate."""
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
@@ -107,7 +109,7 @@ class FlowTable(Table):
 
     @property
     def begun(self) -> float:
-        """Flow rate at the start [m3/s (m2/s in 2-D)]."""
+        """Initial flow rate [m3/s (m2/s in 2-D)]."""
         return self._flows[0]
 
     @property
@@ -116,13 +118,13 @@ class FlowTable(Table):
         return max(self._flows)
 
     def passed(self, time: float) -> float:
-        """Return the volume [m3], in 2-D the area [m2], of the fluid that has flowed until ``time`` [s]."""
+        """Return the volume [m3], in 2-D the area [m2], of the fluid that flows from the start until ``time`` [s]."""
         times = np.append(np.clip(self.times or 0.0, 0.0, time), time)
         return float(np.trapezoid(np.interp(times, self.times or (0.0,), self._flows), times))
 
     def time_for(self, volume: float) -> float:
-        """Return the time [s] at which a volume (in 2-D an area) of fluid has flowed. Return infinity if it
-        never does."""
+        """Return the time [s] at which the given ``volume`` of fluid, in 2-D an area, has flowed. The time is infinite
+        if less fluid flows in total."""
         last = float((self.times or (0.0,))[-1])
         times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
         flows = np.interp(times, self.times or (0.0,), self._flows)
@@ -142,7 +144,7 @@ class FlowTable(Table):
 
 
 class SinkDrain(FlowTable):
-    """A sink. Fluid flows towards it from all sides with a given flow rate."""
+    """A sink that removes fluid with a given flow rate. Fluid flows towards the sink from all sides."""
 
     shape: Literal["sink"]
     """Kind of the drain."""
@@ -210,7 +212,8 @@ def _check_reached(scene: Any, drain: BoxDrain | PlaneDrain, ends: Points, path:
 
 
 def sink_limit(scene: Any, values: Any) -> float:
-    """Return the longest time step [s] with sinks: fluid near a sink moves at most 0.4 spacings in a step."""
+    """Return the longest time step [s] for a scene with sinks. In a time step, fluid near a sink moves at most 0.4
+    spacings."""
     longest, spacing = inf, scene.discretisation.spacing
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
@@ -234,12 +237,12 @@ def drain_parameters(scene: Any) -> list[Parameter]:
 
 DIRECTIONS = 1024
 PARTS = 16
-"""Number of directions around a sink, and of sample points along a direction."""
+"""Number of directions around a sink, and number of sample points along each direction."""
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the solid angle [sr] around ``place`` (d,) [m] that is free of walls within ``radius`` [m]. In 2-D, return
-    the angle [rad]."""
+    """Return the solid angle [sr] of the directions from ``place`` (d,) [m] without walls within ``radius`` [m]. In
+    2-D, return the angle [rad] of these directions."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS

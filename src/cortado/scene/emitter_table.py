@@ -21,24 +21,24 @@ from cortado.scene.tables import MISSING, Direction, FieldPath, Length, Text, Ve
 
 @dataclass(frozen=True)
 class EmitterSample:
-    """The m particles of an emitter, sorted by layer. The first layer is at the opening."""
+    """Particles of an emitter, sorted by layer. The first layer is at the opening, and m is the number of particles."""
 
     offsets: Points
-    """Vectors from the emitter's axis to the particles (m, d) [m]."""
+    """Vectors (m, d) [m] from the axis of the emitter to the particles, perpendicular to the axis."""
     upstream: Points
-    """Distances of particles upstream of the opening (m,) [m]."""
+    """Initial distances of the particles from the opening, upstream (m,) [m]."""
     positions: Points
     velocities: Points
     speed: float
     """Initial speed of the flow [m/s]."""
     layer: int
-    """Number of particles per layer."""
+    """Number of particles in each layer."""
     column: float
-    """Length of the column of fluid behind the opening [m]."""
+    """Length of the column of fluid that waits behind the opening [m]."""
 
     def in_line(self, name: str, first: int, others: Any, particles: int) -> Points:
-        """Return the initial distances upstream of the opening (particles,) [m]; 0 for particles that the emitter does
-        not emit.
+        """Return the initial distance of each particle upstream of the opening (particles,) [m]. The distance is 0 for
+        particles of other emitters and bodies.
 
         ``first`` is the index of the emitter's first particle. ``others`` are fields of a state.
         """
@@ -50,7 +50,7 @@ class EmitterSample:
         return np.where(np.ravel(again) > 0.0, joined, found)
 
     def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
-        """Return True for each particle that has not left the emitter yet (particles,). ``others`` are fields of a
+        """Return a mask of the particles that have not left the emitter yet (particles,). ``others`` are fields of a
         state."""
         emitted = float(np.ravel(others[emitted_name(name)])[0])
         return self.in_line(name, first, others, particles) > emitted
@@ -60,13 +60,14 @@ OF_OPENINGS = ("emitted", "again", "drained", ".count")
 COLUMN = 6.0
 """Default length of the column of fluid behind the opening [spacings]."""
 path_name = ending("path")
-"""Parameter: position of an emitter's opening over time [m]."""
+"""Name of a parameter: position of an emitter's opening over time [m]."""
 outlet_name = ending("outlet")
-"""Field: position of an emitter's opening [m]."""
+"""Name of a state field: position of an emitter's opening [m]."""
 emitted_name = ending("emitted")
-"""Field: length of the column that has left an emitter [m]."""
+"""Name of a state field: length of the fluid column that has left an emitter [m]."""
 again_name = ending("again")
-"""Field: place of each re-emitted particle in the queue of the emitter, from 1; 0 for particles outside the queue."""
+"""Name of a state field: position of each particle in the queue to be emitted again, counted from 1. The position is 0
+for particles outside the queue."""
 
 
 def _path_of(name: str, of: str, outlet: Any, course: Knots | None = None) -> Parameter:
@@ -78,12 +79,13 @@ OutletPath: Any = course_table(_path_of("emitter_path", "an emitter", (0.0, 0.0)
 
 
 class EmitterTable(FluidBody, FlowTable):
-    """An emitter with a round or rectangular opening, in 2-D a line. Fluid leaves the opening at one speed."""
+    """An emitter with a round or rectangular opening, in 2-D a line. Fluid leaves the whole opening with the same
+    speed."""
 
     name: Text = "nozzle"
-    """Name of the emitter. The names of the emitter's parameters begin with it."""
+    """Name of the emitter. The names of its parameters begin with this name."""
     outlet: Vector[Length]
-    """(d,) Middle of the opening [m]."""
+    """(d,) Position of the middle of the opening [m]."""
     direction: Direction = (0.0, -1.0, 0.0)
     """(d,) Direction of the flow; its length has no effect."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
@@ -98,14 +100,14 @@ class EmitterTable(FluidBody, FlowTable):
     """Total volume that the emitter emits [m3], in 2-D area [m2]. If left out, commands such as ``cortado run`` provide
     enough fluid for the run, but `Simulation` provides only the waiting column (see `Scene.lasting`)."""
     fed_by: tuple[Text, ...] = ()
-    """Names of drains. The emitter emits the particles that these drains remove. It then has no other fluid than the
-    waiting column and `volume`. A drain can feed only one emitter."""
+    """Names of drains. The emitter emits the particles that these drains remove. Besides these particles, the emitter
+    has only the waiting column and `volume`. A drain can feed only one emitter."""
     path: OutletPath | None = None
-    """Middle of the opening over time; if left out, the opening stays at `outlet`."""
+    """Position of the middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest offset of a particle from its lattice position in its layer, along each axis of the opening, in spacings;
-    equal in all runs. With the solver "projection" the default is 0.05, because a stream on an exact lattice is too
-    wide."""
+    """Largest random offset of a particle from its lattice position, along each axis of the opening, in spacings. The
+    offsets are equal in all runs. With the solver "projection" the default is 0.05, because a stream on an exact
+    lattice is too wide."""
 
     @field_validator("direction")
     @classmethod
@@ -139,11 +141,13 @@ class EmitterTable(FluidBody, FlowTable):
         return float(max(math.ceil(given - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """Return the time [s] at which the emitter runs out of fluid; infinite if never."""
+        """Return the time [s] at which the emitter runs out of fluid. The time is infinite if the emitter never runs
+        out."""
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return the table with enough fluid until ``time`` [s]. A table with a volume is returned unchanged."""
+        """Return the table with enough fluid until ``time`` [s]. A table with the key ``volume`` is returned
+        unchanged."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)
@@ -154,11 +158,11 @@ class EmitterTable(FluidBody, FlowTable):
         return self.greatest / self.area(spacing)
 
     def area(self, spacing: float) -> float:
-        """Return the area of the lattice cells inside the opening [m2], in 2-D their width [m]."""
+        """Return the total area of the lattice cells inside the opening [m2], in 2-D their total width [m]."""
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """Area of the opening [m2], in 2-D its width [m]."""
+        """Area of the opening that the scene file prescribes [m2], in 2-D its width [m]."""
         if self.radius is None:
             return math.prod(self.sides or ())
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
@@ -168,7 +172,7 @@ class EmitterTable(FluidBody, FlowTable):
         return max(self.sides or (2.0 * (self.radius or 0.0),))
 
     def opening(self, spacing: float) -> Points:
-        """Return the positions (n, d) [m] of a layer of particles in the opening."""
+        """Return the positions (n, d) [m] of one layer of particles, in the opening."""
         return np.array(self.outlet) + self._cross_section(spacing)
 
     def sample(self, spacing: float) -> EmitterSample:
@@ -197,7 +201,7 @@ class EmitterTable(FluidBody, FlowTable):
         return sample.positions[sample.upstream < sample.column]
 
     def _cells(self, spacing: float) -> Points:
-        """Return the numbers of lattice cells across the opening (d - 1,)."""
+        """Return the number of lattice cells along each axis of the opening (d - 1,)."""
         sides = self.sides or (2.0 * (self.radius or 0.0),) * (len(self.outlet) - 1)
         return np.maximum(whole_cells(np.array(sides), spacing), 1.0)
 
@@ -229,7 +233,7 @@ def check_fed(scene: Any) -> None:
 
 
 def check_columns(scene: Any) -> None:
-    """Check that at the start no sheet crosses the waiting column of an emitter or is close to the opening."""
+    """Check that no sheet crosses the waiting column of an emitter at the start, or is too close to its opening."""
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         opening, ahead = emitter.opening(spacing), spacing * np.array(emitter.direction)
@@ -243,15 +247,15 @@ def check_columns(scene: Any) -> None:
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
-    """Return the name of each emitter, the index of its first particle, and its particles. ``count`` is the number of
-    fluid particles in the scene."""
+    """Return three values for each emitter: its name, the index of its first particle, and its particles. ``count`` is
+    the number of fluid particles in the scene."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
     return list(zip([emitter.name for emitter in scene.emitter], ends[:-1].tolist(), made, strict=True))
 
 
 def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:
-    """Return True for each particle that has not left its emitter yet (particles,). ``others`` are fields of a
+    """Return a mask of the particles that have not left their emitter yet (particles,). ``others`` are fields of a
     state."""
     found = np.zeros(particles, dtype=bool)
     for name, first, sample in samples(scene, particles):

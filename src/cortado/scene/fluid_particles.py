@@ -1,7 +1,7 @@
-"""Fluid particles of a scene, in float64.
+"""Initial fluid particles of a scene, in float64.
 
-A body of fluid with a curved or oblique surface starts with the number of particles that fits its volume. These
-particles are then packed (`cortado.discretise.packing`).
+For a body of fluid with a curved or oblique surface, the number of particles fits the volume of the body. The particles
+are then packed (`cortado.discretise.packing`).
 """
 
 from collections.abc import Mapping
@@ -20,15 +20,15 @@ from cortado.scene.fluids import ALIGNED, PointsFluid, RegionFluid
 from cortado.scene.scene import Scene
 
 FINER = 4
-"""Number of parts along each axis into which a lattice cell is divided to measure a volume."""
+"""Number of equal parts of a lattice cell along each axis, for measuring the volume of a body of fluid."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
-"""Greatest fraction of missing particles near the surface of a packed body, and in the whole body."""
+"""Greatest fractions of the particles that a packed body may lack: near its surface, and in the whole body."""
 BESIDE = 2
-"""Greatest distance between an omitted particle and the surface, along each axis [cells]."""
+"""Greatest distance from the surface at which particles are left out, along each axis [cells]."""
 FAR = 4.0
-"""Greatest depth below the surface that is computed [spacings]."""
+"""Greatest distance from the surface that is computed [spacings]."""
 DIGITS = 6
-"""Number of decimals of depths [spacings] when particles are sorted by depth."""
+"""Number of decimals to which depths [spacings] are rounded before sorting."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,17 @@ class CutBody:
     spacing: float
 
     def distance(self, points: Points, reach: float) -> Points:
-        """Return the distances (n,) [m] of points (n, d) [m] from the body, negative inside."""
+        """Return the signed distances (n,) [m] of points (n, d) [m] from the body, negative inside."""
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
-        """Return the fraction of each lattice cell that is inside the body (n,). ``points`` (n, d) are the cells'
-        centres [m]."""
+        """Return the fraction of each lattice cell inside the body (n,). ``points`` (n, d) [m] are the centres of the
+        cells."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
-        """Return the volume more than ``depth`` [m] below the surface [m^d]. ``beside_cuts`` restricts it to cells near
-        cells that the surface cuts."""
+        """Return the volume of the part of the body more than ``depth`` [m] below its surface [m^d]. If ``beside_cuts``
+        is true, count only cells near the cells that the surface cuts."""
         dimension, fine = self.room.dimension, self.spacing / FINER
         cells, reach = self.fluid.block(self.spacing).grown(1).points(), depth + self.spacing
         cells = cells[self._beside_cuts(cells)] if beside_cuts else cells
@@ -62,7 +62,7 @@ class CutBody:
 
     @cached_property
     def asked(self) -> float:
-        """Prescribed volume of the body outside walls [m^d]."""
+        """Prescribed volume of the body, without its parts inside walls [m^d]."""
         everywhere = Room(Region.everywhere(self.room.dimension), (), self.room.periods)
         return self.fluid.volume(self.spacing) * self._held / replace(self, room=everywhere)._held
 
@@ -103,11 +103,11 @@ class CutBody:
 def air_around(
     bodies: tuple[CutBody, ...], staying: Points, lower: Points, lengths: Points, reach: float
 ) -> tuple[Points, Points]:
-    """Return lattice points in the air, within ``reach`` [m] of the surfaces of bodies (m, d) [m]. Also return the
-    fraction of air in the lattice cell around each point (m,).
+    """Return lattice points (m, d) [m] in the air around bodies of fluid, within ``reach`` [m] of their surfaces. Also
+    return the fraction of air in the lattice cell around each point (m,).
 
     ``staying`` (k, d) [m] are the particles that packing does not move. ``lower`` and ``lengths`` (d,) [m] are the
-    lower corner and the lengths of the periodic box; a length is 0 along an axis that is not periodic.
+    lower corner and the lengths of the periodic box. The length is 0 along an axis that is not periodic.
     """
     found = []
     for number, body in enumerate(bodies):
@@ -143,20 +143,20 @@ class FluidSample:
     sizes: tuple[int, ...]
     """Number of particles of each body of fluid, without emitters."""
     asked: tuple[float, ...]
-    """Prescribed volume of each body outside walls [m^d]."""
+    """Prescribed volume of each body, without its parts inside walls [m^d]."""
     bodies: tuple[CutBody, ...]
     is_packed: NDArray[np.bool_]
     """True for packed particles (n,)."""
     is_placed: NDArray[np.bool_]
-    """True for particles of a file of points or of an emitter (n,)."""
+    """True for particles from a file of positions or from an emitter (n,)."""
     emitters: tuple[tuple[str, int, EmitterSample], ...]
-    """Name of each emitter, index of its first particle, and its particles."""
+    """For each emitter, its name, the index of its first particle, and its particles."""
     places: Points
-    """Resting positions of particles outside the simulation (n, d) [m]."""
+    """Positions (n, d) [m] where particles rest while they are outside the simulation."""
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """Return the sample of the particles with sorted indices ``kept`` (m,). No particle of an emitter may be
-        missing."""
+        """Return a sample with only the particles at the sorted indices ``kept`` (m,). All particles of emitters must
+        be in ``kept``."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -166,7 +166,7 @@ class FluidSample:
 
     @property
     def names(self) -> NDArray[np.str_]:
-        """Return the name of the body of each particle (n,), such as "fluid[1]"."""
+        """Return, for each particle (n,), the name of its body of fluid, such as "fluid[1]"."""
         named = *(f"fluid[{k}]" for k in range(len(self.sizes))), *(f"emitter {name}" for name, _, _ in self.emitters)
         ends = *np.cumsum(self.sizes), *(first for _, first, _ in self.emitters[1:]), len(self.positions)
         return np.repeat(named, np.diff(ends[: len(named)], prepend=0))
@@ -178,8 +178,8 @@ class FluidSample:
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """Build the fluid particles of a scene before packing. Raises `InputError` if a file of points no longer exists, or
-    if walls leave no room for a body of fluid."""
+    """Build the fluid particles of a scene before packing. Raises `InputError` if a file of particle positions no
+    longer exists, or if walls leave no space for a body of fluid."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = scene.room, scene.discretisation.support_radius
     bodies, positions, velocities, asked = list[CutBody | None](), list[Points](), list[Points](), list[float]()
@@ -225,10 +225,10 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def resting_places(scene: Scene, count: int) -> Points:
-    """Return positions (count, d) [m] for particles outside the simulation: reserves of emitters, and particles that
-    drains removed.
+    """Return positions (count, d) [m] for particles outside the simulation. Particles outside the simulation are
+    reserves of emitters, and particles that drains have removed.
 
-    The positions are far from the scene and from each other. They are NaN if all axes are periodic.
+    The positions are far from the scene and from each other. If all axes are periodic, the positions are NaN.
     """
     spacing, support = scene.discretisation.spacing, scene.discretisation.support_radius
     boxes = [body.extent(spacing) for body in (*scene.fluid, *scene.emitter)]
@@ -247,12 +247,12 @@ def resting_places(scene: Scene, count: int) -> Points:
 
 @dataclass(frozen=True)
 class FluidMasses:
-    """Masses of fluid by phase [kg], in 2-D per metre of depth."""
+    """Actual and prescribed mass of each phase [kg], in 2-D per metre of depth."""
 
     given: Mapping[str, float]
-    """Initial mass of the particles, with the particles in emitters."""
+    """Actual initial mass of all particles, including the particles in emitters, by phase name."""
     asked: Mapping[str, float]
-    """Prescribed mass of the bodies of fluid and of the fluid in emitters."""
+    """Prescribed mass of the bodies of fluid and of the fluid in emitters, by phase name."""
 
     @classmethod
     def of(cls, scene: Scene, fluid: FluidSample) -> Self:
@@ -267,8 +267,8 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return a message for each phase with a wrong mass, by the phase's name. A mass is wrong if it differs from
-        the prescribed mass by more than `EXCESS`."""
+        """Return messages about wrong masses, by phase name. A mass is wrong if it differs from the prescribed mass by
+        more than the fraction `EXCESS`."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()

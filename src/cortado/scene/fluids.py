@@ -20,7 +20,7 @@ ALIGNED = 1e-3
 
 
 class FluidBody(Table):
-    """Particles of one phase, in a body of fluid or in an emitter."""
+    """Base of tables that create particles of one phase: bodies of fluid and emitters."""
 
     phase: Text
     """Name of the phase."""
@@ -31,7 +31,7 @@ class FluidBody(Table):
 
     @abstractmethod
     def extent(self, spacing: float) -> tuple[Points, Points]:
-        """Return the lower and upper corner of a box around all particles, (d,) each [m]."""
+        """Return the lower and the upper corner (d,) [m] of a box around all particles."""
 
     @abstractmethod
     def particles(self, spacing: float) -> Points:
@@ -42,10 +42,10 @@ class Fluid(FluidBody):
     """A body of fluid."""
 
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
-    """(d,) Velocity at the start [m/s]."""
+    """(d,) Initial velocity [m/s]."""
     angular_velocity: Turns[Annotated[float, quantity("rad/s")]] = None
     """Initial angular velocity about the middle of the body [rad/s]; no rotation if left out. In 3-D a vector, in 2-D
-    one number, counterclockwise."""
+    one number, positive counterclockwise."""
 
     def velocities(self, points: Points) -> Points:
         """Return initial velocities (n, d) [m/s] of particles at positions (n, d) [m]."""
@@ -63,7 +63,7 @@ class Fluid(FluidBody):
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the positions of the particles in ``room`` (n, d) [m]."""
+        """Return the positions (n, d) [m] of the particles inside the region ``room``."""
         return self.particles(spacing)
 
     @abstractmethod
@@ -72,15 +72,15 @@ class Fluid(FluidBody):
 
 
 class RegionFluid(Fluid):
-    """Fluid that fills a shape."""
+    """Base of bodies of fluid that fill a shape."""
 
     @abstractmethod
     def block(self, spacing: float) -> Block: ...
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape with its centroid at the origin, without a rotation. Also return the centroid's position
-        (d,) [m]."""
+        """Return the shape of the body, moved to have its centroid at the origin and without its rotation. Also return
+        the position of the centroid (d,) [m]."""
 
     def volume(self, spacing: float) -> float:
         return self.shape_about()[0].moments().volume
@@ -95,7 +95,8 @@ class RegionFluid(Fluid):
         return self.block(spacing).points()
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the positions of the particles in ``room`` (n, d) [m]. They are at least half a spacing from walls."""
+        """Return the positions (n, d) [m] of the particles inside the region ``room``. All particles are at least half
+        a spacing from walls."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
@@ -105,28 +106,29 @@ class RegionFluid(Fluid):
         ``reach`` [m] are only lower bounds."""
 
     def cuts_cells(self, spacing: float) -> bool:
-        """Test if the surface cuts cells of the lattice."""
+        """Test whether the surface of the body cuts cells of the lattice."""
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return lattice points (n, d) [m] in the box around the shape. ``reach`` [m] extends the box."""
+        """Return the lattice points (n, d) [m] in a box around the shape. The box extends ``reach`` [m] beyond the
+        shape."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
 class Turnable(RegionFluid):
-    """A body of fluid that may be rotated. The particles of a rotated body are packed."""
+    """Base of bodies of fluid that may be rotated. The particles of a rotated body are packed."""
 
     rotation: Turns[Angle] = None
     """Rotation about the middle of the body [rad]; no rotation if left out. In 3-D a rotation vector, in 2-D one
-    number, counterclockwise."""
+    number, positive counterclockwise."""
 
 
 class BoxFluid(BoxShape, Turnable):
-    """A box, filled with particles at ``lower + (i + 1/2) spacing``, or with packed particles if rotated.
+    """A box of fluid. Its particles are at ``lower + (i + 1/2) spacing``, or packed if the box is rotated.
 
     If a side is no multiple of the spacing, the lattice is stretched or compressed by up to 3 %. The mass is then right
-    within 0.3 %. If no lattice fits so well, the particles are packed, and the mass is up to 0.8 % too small.
-    `describe` and a run then print the prescribed and the actual mass.
+    within 0.3 %. If no such lattice fits, the particles are packed, and the mass is up to 0.8 % too small. `describe`
+    and a run then print the prescribed and the actual mass.
     """
 
     def block(self, spacing: float) -> Block:
@@ -145,7 +147,7 @@ class BoxFluid(BoxShape, Turnable):
 
 
 class RoundFluid(RegionFluid):
-    """A body of fluid with a curved surface. Its particles are packed before a run."""
+    """Base of bodies of fluid with a curved surface. The particles are packed before a run."""
 
     def particles(self, spacing: float) -> Points:
         points = self.block(spacing).points()
@@ -182,7 +184,7 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return Region.cylinder(np.array(self.base), self.radius, self.height, self.along).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return a lattice with layers that fill the height of the cylinder."""
+        """Return the lattice points (n, d) [m] of a cylinder, with layers that fill its height."""
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
@@ -219,8 +221,8 @@ class PointsFluid(Fluid):
 
 
 class Filled(Turnable):
-    """A body of fluid that fills a solid shape with packed particles, or with a lattice if the shape is aligned with
-    it."""
+    """Base of bodies of fluid that fill a solid shape with packed particles. If the shape is aligned with the lattice,
+    the particles stay on the lattice."""
 
     def body(self) -> Placed:
         shape, middle = self.shape_about()
@@ -244,10 +246,10 @@ class Filled(Turnable):
 
 
 class FilledShape(Filled):
-    """A body of fluid with a shape and an optional position."""
+    """Base of bodies of fluid with a general shape and an optional position."""
 
     position: OnAxes[Length] = None
-    """(d,) Position of the centroid [m]; if left out, the shape's corners or mesh determine it."""
+    """(d,) Position of the centroid [m]; if left out, the coordinates of the shape's corners or mesh determine it."""
 
     def body(self) -> Placed:
         placed = super().body()
@@ -267,7 +269,7 @@ class TurnedCylinder(Filled, CylinderFluid):
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """Return a rotated box or cylinder as a packed body. Return any other body of fluid unchanged."""
+    """Return a rotated box or cylinder of fluid as a body that is packed. Return any other body of fluid unchanged."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:

@@ -1,4 +1,4 @@
-"""Hinges and springs of free bodies: tables, parameters, degrees of freedom and time step limits."""
+"""Hinges and springs of free bodies: tables, parameters, degrees of freedom and limits of the time step."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ COLUMNS = (("torque", "N m"), ("speed", "rad/s"))
 
 
 class HingeTable(Table):
-    """A hinge of a free body. The hinge keeps one point of the body fixed in space, or fixed to a point of a second
+    """A hinge of a free body. One point of the body stays at a fixed point in space, or at a fixed point of a second
     solid."""
 
     name: Text
@@ -34,20 +34,20 @@ class HingeTable(Table):
     solid: Text
     """Name of the free body."""
     to: Text | None = None
-    """Name of the moving solid to which the body is joined; if left out, the hinge is fixed in space."""
+    """Name of a moving solid to which the hinge joins the free body; if left out, the hinge is fixed in space."""
     position: Vector[Length]
     """(d,) Position of the hinge at the start [m]."""
     axis: tuple[Annotated[float, quantity()], ...] | None = None
     """(3,) Initial direction of the hinge's axis, in 3-D only; its length has no effect. If left out, the hinge is a
     ball joint: the body can turn about every axis."""
     stiffness: Annotated[float, quantity("N m/rad", ge=0.0)] | None = None
-    """Torque of the spring per radian of turn away from `rest_angle` [N m/rad]; in 2-D per metre of depth."""
+    """Stiffness of the spring: torque per radian away from `rest_angle` [N m/rad]; in 2-D per metre of depth."""
     rest_angle: Annotated[float, quantity("rad", ge=-3.0, le=3.0)] = 0.0
-    """Turn since the start at which the spring has no torque [rad]."""
+    """Angle of rotation since the start at which the hinge's spring has no torque [rad]."""
     damping: Annotated[float, quantity("N m s/rad", ge=0.0)] | None = None
-    """Damping coefficient [N m s/rad]: torque per difference between the angular velocity and `speed`."""
+    """Damping coefficient [N m s/rad]: damping torque divided by (`speed` - angular velocity)."""
     torque: Annotated[float, quantity("N m")] | None = None
-    """Constant torque of the motor on the body [N m]."""
+    """Constant torque of the hinge's motor on the body [N m]."""
     speed: Annotated[float, quantity("rad/s")] | None = None
     """Target angular velocity of the motor [rad/s]. The damping drives the body towards this angular velocity."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
@@ -63,7 +63,7 @@ class HingeTable(Table):
 
     @property
     def turned_by(self) -> str | None:
-        """Return the first key of a spring, damper or motor of the hinge, or None."""
+        """Return the first key in the table that belongs to a spring, damper or motor, or None."""
         keys = ("stiffness", "damping", "torque", "speed", "times")
         return next((key for key in keys if getattr(self, key) is not None), None)
 
@@ -88,7 +88,7 @@ class HingeTable(Table):
         return super().in_dimension(dimension, path)
 
     def course(self, name: str) -> Knots | None:
-        """Return the motor's torque or speed over time, or None if it is constant."""
+        """Return the curve of the motor's torque or speed over time, or None for a constant."""
         values = getattr(self, f"{name}s")
         return None if values is None else Knots(np.array(self.times), np.array(values))
 
@@ -98,17 +98,18 @@ class Hold:
     """Degrees of freedom of a free body."""
 
     moving: Three = (1.0, 1.0, 1.0)
-    """For each axis of space, 1 if the body's centre of mass may move along the axis, else 0."""
+    """For each axis of space, 1 if the body's centre of mass may move along this axis, else 0."""
     turning: int = 3
-    """Number of axes about which the body may turn; 3 for a turning body in 2-D."""
+    """Number of axes about which the body may rotate. In 2-D, the number is 3 for a body that may rotate."""
     axis: Three = (0.0, 0.0, 0.0)
     """Unit vector: the axis of rotation if `turning` is 1, or the blocked axis if `turning` is 2."""
     arm: Three = (0.0, 0.0, 0.0)
-    """Vector from the centre of mass to the hinge in the body's frame [m]; 0 without a hinge."""
+    """Vector from the centre of mass to the hinge, in the body's frame [m]; 0 without a hinge."""
 
     @classmethod
     def of(cls, table: SolidTable, dimension: int, hinges: Sequence[HingeTable] = ()) -> Self:
-        """Return the degrees of freedom of a free body, from its hinge or from its key `freedom`."""
+        """Return the degrees of freedom of a free body. The hinge of the body, or the key `freedom` of its table,
+        determines them."""
         for hinge in hinges:
             if hinge.solid == table.name and hinge.to is None:
                 arm = in_frame(table, hinge.position)
@@ -129,8 +130,8 @@ def _three(vector: Any) -> Three:
 
 
 def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
-    """Return the body's inertia (3, 3) about its hinge in the body's frame. Without a hinge, return the inertia about
-    the centre of mass."""
+    """Return the inertia of a body about its hinge (3, 3), in the body's frame. Without a hinge, return the inertia
+    about the centre of mass."""
     arm = np.array(hold.arm)
     return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
@@ -175,7 +176,8 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
 def number_of(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Create a scalar parameter. ``change`` is the typical change of a value that is 0 or may be negative."""
+    """Create a scalar parameter. ``change`` is the typical change of the parameter if its value is 0 or may be
+    negative."""
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:
         return np.where((np.asarray(at) == 0.0) | (values is Range.ANY), change, np.abs(at))
@@ -184,7 +186,7 @@ def number_of(
 
 
 def in_frame(table: SolidTable, place: Any) -> Points:
-    """Convert the initial position of a point of a solid (d,) to the solid's frame [m]."""
+    """Convert a point (d,) [m] of a solid from its initial position in space to the solid's frame."""
     return np.asarray((np.array(place) - table.middle()) @ table.turn(len(place)))
 
 
@@ -213,9 +215,9 @@ class Link:
     body: int
     """Index of the free body."""
     against: int
-    """Index of the second solid among the moving solids; -1 if it is at rest or absent."""
+    """Index of the second solid among all moving solids; -1 without a moving second solid."""
     other: int
-    """Index of the second solid among the free bodies; -1 if it is not a free body."""
+    """Index of the second solid among the free bodies. The index is -1 if the second solid is not a free body."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +229,8 @@ class Joint(Link):
 
 
 def linked(link: Any, moved: Sequence[SolidTable]) -> tuple[SolidTable, SolidTable | None, tuple[str, int, int, int]]:
-    """Return the two solids of a spring or hinge, and the fields of its `Link`. ``moved`` are all moving solids."""
+    """Return the two solids of a spring or hinge, and the values of the fields of its `Link`. ``moved`` are all moving
+    solids of the scene."""
     names, bodies = [one.name for one in moved], [one.name for one in moved if one.motion == "free"]
     against = names.index(link.to) if link.to in names else -1
     other = bodies.index(link.to) if link.to in bodies else -1
@@ -248,23 +251,23 @@ class SpringTable(Table):
     """A spring with a damper between a free body and a second solid or a point in space."""
 
     name: Text
-    """Name of the spring. The names of the spring's parameters begin with it."""
+    """Name of the spring. The names of its parameters begin with this name."""
     solid: Text
     """Name of the free body."""
     point: Vector[Length]
-    """(d,) Initial position of the spring's end on the free body [m]."""
+    """(d,) Initial position of the spring's first end, on the free body [m]."""
     to: Text | None = None
     """Name of the second solid; if left out, the spring's second end is fixed in space."""
     anchor: Vector[Length]
     """(d,) Initial position of the spring's second end [m]."""
     stiffness: Annotated[float, quantity("N/m", gt=0.0)]
-    """Force per metre of extension [N/m]; in 2-D per metre of depth."""
+    """Stiffness: force per metre of extension [N/m]; in 2-D per metre of depth."""
     rest_length: Annotated[float, quantity("m", ge=0.0)] | None = None
-    """Length of the spring without force [m]; the initial length if left out."""
+    """Length at which the spring has no force [m]; the initial length if left out."""
     preload: Annotated[float, quantity("N")] | None = None
     """Initial tension of the spring [N], in place of `rest_length`."""
     damping: Annotated[float, quantity("N s/m", ge=0.0)] = 0.0
-    """Damping force per rate of extension [N s/m]."""
+    """Damping coefficient: force per rate of extension [N s/m]."""
     slack: Flag = False
     """If true, the spring pulls but never pushes, like a mooring line."""
 
@@ -281,7 +284,7 @@ class SpringTable(Table):
 
     @property
     def length(self) -> float:
-        """Return the initial length [m]; 0 if `point` and `anchor` have different dimensions."""
+        """Return the initial length of the spring [m]; 0 if `point` and `anchor` have different dimensions."""
         fits = len(self.anchor) == len(self.point)
         return float(np.linalg.norm(np.subtract(self.anchor, self.point))) if fits else 0.0
 
@@ -293,7 +296,8 @@ class SpringTable(Table):
 
 
 def check_springs(springs: Sequence[SpringTable], hinges: Sequence[HingeTable], solids: Sequence[SolidTable]) -> None:
-    """Check that springs name existing solids, and that no two solids, hinges or springs have the same name."""
+    """Check that springs refer to existing solids. Also check that all solids, hinges and springs have
+    different names."""
     names = [solid.name for solid in solids]
     for index, hinge in enumerate(hinges):
         if hinge.name in names:
@@ -376,9 +380,9 @@ def spring_limit(scene: Any, values: Arrays) -> float:
 @dataclass(frozen=True)
 class Ends(Link):
     point: Points
-    """Position of the spring's end on the rigid body, in the body's frame (d,) [m]."""
+    """Position of the spring's first end (d,) [m], in the frame of the free body."""
     anchor: Points
-    """Position of the spring's second end (d,) [m]: in the frame of a moving solid, else in space."""
+    """Position of the spring's second end (d,) [m], in the frame of a moving second solid, else in space."""
     slack: bool
 
 

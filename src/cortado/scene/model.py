@@ -1,4 +1,4 @@
-"""The tables of a scene for phases, mixtures, forces and discretisation, and the scene's table of tables."""
+"""The tables of a scene file: phases, mixtures, forces and discretisation, and `SceneTables` with all tables."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,29 +24,32 @@ from cortado.scene.solvers import AnySolver, what_suits
 from cortado.scene.tables import Colour, Flag, OneOf, Several, Table, Text, Vector, count, field_error, quantity
 
 SHORTEST = 40.0
-"""Smallest default regularisation of a yield stress [s]."""
+"""Smallest default of the regularisation time for fluids with a yield stress [s]."""
 
 
 class RheologyTable(Table):
-    """A law of viscosity. The law's numbers are parameters, such as ``carreau.flow_index``."""
+    """Base of the laws for a viscosity that depends on the shear rate. The coefficients of a law are parameters, such
+    as ``carreau.flow_index``."""
 
     kind: str
-    """Name of the law."""
+    """Name of the law of viscosity."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
-        """Return the numbers of the law by name. ``viscosity`` is the key of the phase [Pa s]."""
+        """Return the coefficients of the law by name. ``viscosity`` [Pa s] is the value of this key in the table of the
+        phase."""
         return {name: value for name, value in self.model_dump().items() if name != "kind"}
 
     def thickest(self, viscosity: float) -> float:
-        """Return the greatest viscosity [Pa s]. ``viscosity`` is the key of the phase [Pa s]."""
+        """Return the greatest viscosity at any shear rate [Pa s]. ``viscosity`` [Pa s] is the value of this key in the
+        table of the phase."""
         return viscosity
 
 
 class Thinning(RheologyTable):
-    """Base of the laws of viscosity that have a power of the shear rate."""
+    """Base of the laws of viscosity with a power of the shear rate."""
 
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """Exponent n [-]: with n < 1 the fluid is shear-thinning, with n > 1 shear-thickening."""
+    """Exponent n of the law [-]. Fluid with n < 1 is shear-thinning, and fluid with n > 1 is shear-thickening."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
     """Shear rate that keeps the viscosity finite at rest [1/s]. The law uses sqrt(shear_rate² + least_shear_rate²)."""
 
@@ -59,7 +62,7 @@ class PowerLaw(Thinning):
     `viscosity` of the phase is the viscosity at a shear rate of 1/s."""
 
     kind: Literal["power_law"] = "power_law"
-    """Name of the law."""
+    """Name of the law of viscosity."""
 
 
 class Carreau(RheologyTable):
@@ -68,11 +71,11 @@ class Carreau(RheologyTable):
     """
 
     kind: Literal["carreau"] = "carreau"
-    """Name of the law."""
+    """Name of the law of viscosity."""
     relaxation_time: Annotated[float, quantity("s", ge=0.0)]
-    """Relaxation time [s]. The viscosity changes at shear rates above its inverse."""
+    """Relaxation time [s]. The viscosity begins to change at the shear rate 1 / relaxation_time."""
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
-    """Exponent n [-]: with n < 1 the fluid is shear-thinning."""
+    """Exponent n of the law [-]. Fluid with n < 1 is shear-thinning."""
     infinite_viscosity: Annotated[float, quantity("Pa s", ge=0.0)] = 0.0
     """Viscosity in the limit of large shear rates [Pa s]."""
 
@@ -84,10 +87,10 @@ class Yielding(RheologyTable):
     """Base of the laws of viscosity with a yield stress."""
 
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
-    """Stress below which the fluid hardly flows [Pa]."""
+    """Yield stress [Pa]. At lower stress the fluid hardly flows."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
     """Regularisation time of Papanastasiou (1987) [s]. The viscosity at rest is viscosity + yield_stress
-    regularisation. If left out, the longer of 40 s and 100 viscosity / yield_stress."""
+    regularisation. If left out, the regularisation time is 100 viscosity / yield_stress, but at least 40 s."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
         growth = self.regularisation
@@ -104,7 +107,7 @@ class Bingham(Yielding):
     exp(-regularisation shear_rate)) / shear_rate. The key `viscosity` of the phase is the viscosity of fast flow."""
 
     kind: Literal["bingham"] = "bingham"
-    """Name of the law."""
+    """Name of the law of viscosity."""
 
 
 class HerschelBulkley(Yielding, Thinning):
@@ -112,7 +115,7 @@ class HerschelBulkley(Yielding, Thinning):
     consistency."""
 
     kind: Literal["herschel_bulkley"] = "herschel_bulkley"
-    """Name of the law."""
+    """Name of the law of viscosity."""
 
 
 AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(discriminator="kind")]
@@ -124,39 +127,39 @@ class MixtureTable(Table):
     free_energy: Literal["double_well", "miscible"] = "double_well"
     """"double_well" separates the phases; "miscible" mixes the phases by Fick's law."""
     strength: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor of the free energy [-]."""
+    """Dimensionless factor of the free energy [-]."""
     mobility: Annotated[float, quantity("m2/s", ge=0.0)] = 0.0
     """Mobility of the Cahn-Hilliard equation [m2/s]. With 0 there is no diffusion between phases."""
     mobility_form: Literal["degenerate", "constant"] = "degenerate"
     """With "degenerate", phases diffuse only at interfaces; with "constant", phases diffuse everywhere."""
     interface_width: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Width of an interface [m]; one spacing if left out. The mass fraction changes from 10 % to 90 % over 4.39
-    interface_width / sqrt(strength)."""
+    """Width parameter of an interface [m]; one spacing if left out. Across an interface, the mass fraction changes from
+    10 % to 90 % over the distance 4.39 interface_width / sqrt(strength)."""
 
     def width(self, spacing: float) -> float:
         return spacing if self.interface_width is None else self.interface_width
 
 
 OTHER_TABLES = ("problem", "optimise", "fit", "dataset")
-"""Tables in a scene file that do not belong to the scene."""
+"""Tables that a scene file may have besides the tables of the scene."""
 
 
 class DiscretisationTable(Table):
-    """Spacing, smoothing kernel and lattice of the fluid particles."""
+    """Particle spacing, smoothing kernel and initial lattice of the fluid particles."""
 
     spacing: Annotated[float, quantity("m", gt=0.0)]
     """Distance between particles at rest [m]."""
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
-    """Support radius / spacing: particles interact within the support radius. With the solver "projection" the default
-    is 2.6 if the kernel is left out, too."""
+    """Support radius divided by the spacing. Particles closer than the support radius interact. With the solver
+    "projection" the default is 2.6, unless the kernel is given."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
     """Name of the smoothing kernel. With the solver "projection" the default is "wendland_c2", unless the support is
     given."""
 
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest offset of a particle from its initial position, along each axis, in spacings; equal in all runs. With the
-    solver "projection" and all axes periodic the default is 0.05, because fluid on an exact lattice is too stiff.
-    Points of files are not moved."""
+    """Largest random offset of a particle from its initial position, along each axis, in spacings. The offsets are
+    equal in all runs. With the solver "projection" and all axes periodic the default is 0.05, because fluid on an exact
+    lattice is too stiff. Particles from files are not moved."""
 
     @property
     def support_radius(self) -> float:
@@ -164,31 +167,31 @@ class DiscretisationTable(Table):
 
 
 class Phase(Coloured):
-    """A phase of the fluid: a material with its density, viscosity and look."""
+    """A phase of the fluid: a material with its density, viscosity and appearance."""
 
     materials: ClassVar = LIQUIDS
     plain: ClassVar = (0.1, 0.3, 0.8)
 
     name: Text
-    """Name of the phase, to which bodies of fluid refer."""
+    """Name of the phase. Bodies of fluid refer to this name."""
     rest_density: Annotated[float, quantity("kg/m3", gt=0.0)]
     """Density of the fluid at rest [kg/m3]."""
     viscosity: Annotated[float, quantity("Pa s", ge=0.0)]
     """Dynamic viscosity [Pa s]."""
     rheology: AnyRheology | None = None
-    """Dependence of the viscosity on the shear rate; constant if left out."""
+    """Law for a viscosity that depends on the shear rate; if left out, the viscosity is constant."""
     material: Annotated[str, OneOf(tuple(LIQUIDS))] | None = None
-    """Material of the phase in pictures, which sets its colour and transparency. Simulations do not depend on it."""
+    """Material that sets the colour and transparency of the phase in pictures. Simulations ignore the material."""
     colour: Colour | None = None
     """(3,) Colour in pictures: red, green and blue from 0 to 1, in linear light. If left out, the colour of the
     material, or [0.1, 0.3, 0.8] without a material."""
 
 
 class FixedForces(Table):
-    """Forces that every scene has."""
+    """Forces that exist in every scene."""
 
     gravity: Vector[Annotated[float, quantity("m/s2")]] = (0.0, -9.81, 0.0)
-    """(d,) Acceleration by gravity [m/s2]. With schedule.gravity, it must equal the schedule's first value."""
+    """(d,) Gravitational acceleration [m/s2]. If schedule.gravity is given, it must begin with this vector."""
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
     """Form of the viscous force: "stress" or "pairwise", or "none" for no force. The form "stress" is accurate within 1
     % for a shear wave with 40 particles per wavelength. It exerts no force on fluid in rigid rotation. The form
@@ -217,21 +220,21 @@ def _with(given: Any, chosen: Mapping[str, Any]) -> Any:
 
 
 class SceneTables(Table):
-    """All tables of a scene. Checks across tables follow in `Scene`."""
+    """All tables of a scene. `Scene` also checks that the tables fit together."""
 
     beside: ClassVar = OTHER_TABLES
     name: Text = "scene"
     """Name of the scene, shown in titles."""
     dimension: Annotated[int, count(2, 3)]
-    """Number d of dimensions and of components of vectors: 2 for a plane, 3 for space."""
+    """Number d of dimensions, and of components of vectors: 2 for a plane, 3 for space."""
     discretisation: DiscretisationTable
     """How the fluid is divided into particles."""
     phase: Several[Phase]
-    """The materials. Mass fractions have one component for each phase, in this order."""
+    """The phases of the fluid. Mass fractions have one component for each phase, in this order."""
     fluid: tuple[AnyFluid, ...] = ()
     """The bodies of fluid, in the order of their particles. A scene with an emitter may have no body of fluid."""
     emitter: tuple[EmitterTable, ...] = ()
-    """Emitters, from which fluid enters."""
+    """Emitters, through which fluid enters the scene."""
     drain: tuple[AnyDrain, ...] = ()
     """Drains, which remove particles from the fluid."""
     container: AnyContainer = Field(default=NoContainer(), validate_default=True)
@@ -243,11 +246,11 @@ class SceneTables(Table):
     spring: tuple[SpringTable, ...] = ()
     """Springs of free bodies."""
     mixture: MixtureTable = MixtureTable()
-    """Diffusion between phases."""
+    """Diffusion and separation of phases."""
     forces: Forces = Field(default=Forces(), validate_default=True)
     """Gravity, viscosity, pressure and Cortado's optional forces."""
     force: AnyForces = ()
-    """Additional forces from installed packages."""
+    """Additional forces that installed packages provide."""
     solver: AnySolver
     """Solver and time step."""
     schedule: Schedule = Schedule()
@@ -265,7 +268,7 @@ class SceneTables(Table):
 
     @property
     def periods(self) -> tuple[Points, Points]:
-        """Return the lower corner and the lengths of the periodic box, each (d,) [m]. The length is 0 along an axis
+        """Return the lower corner (d,) [m] and the lengths (d,) [m] of the periodic box. The length is 0 along an axis
         that is not periodic."""
         return self.container.periods(self.dimension)
 
@@ -275,17 +278,17 @@ class SceneTables(Table):
 
     @property
     def region(self) -> Region:
-        """Return the region inside the container, unbounded along periodic axes."""
+        """Return the region inside the container. The region is unbounded along periodic axes."""
         return self.container.region(self.dimension).opened(self.periods[1])
 
     @property
     def room(self) -> Room:
-        """Return the region for fluid at the start: inside the container and outside solids."""
+        """Return the region where fluid may be at the start: inside the container and outside all solids."""
         return Room(self.region, solids_of(thick(self.solid)), self.periods[1])
 
     @property
     def resting_room(self) -> Room:
-        """Return the region for fluid inside the container and outside solids at rest. Moving solids are ignored."""
+        """Return the region inside the container and outside the solids at rest. Moving solids are ignored."""
         return replace(self.room, solids=solids_of(tuple(solid for solid in thick(self.solid) if not solid.moves)))
 
     @model_validator(mode="before")

@@ -1,4 +1,4 @@
-"""Parameters over time, moving solids, and names of solids' fields and parameters."""
+"""Parameters over time, motion of solids, and names of the fields and parameters of solids."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,23 +19,24 @@ from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error
 
 
 class Course(Table):
-    """Values of a parameter over time. They are constant before the first and after the last of the given times."""
+    """Values of a parameter over time. The values are constant before the first and after the last of the
+    given times."""
 
     columns: ClassVar[Callable[[int], Columns]]
-    """Function from the number of dimensions to the columns of the file."""
+    """Function that returns the columns of the CSV file for a number of dimensions."""
     grows_from: ClassVar[float | None] = 0.0
-    """Value at the start of a ramp; None for the first value."""
+    """Value from which a ramp starts, or None if the ramp starts from the first of the given values."""
     times: Several[Annotated[float, quantity("s", ge=0.0)]] | None = None
     """(k,) Times since the first state of the run, increasing [s]."""
     values: Any = None
-    """(k, components) Values in the unit of the parameter."""
+    """(k, components) Values of the parameter at `times`, in the unit of the parameter."""
     file: File | None = None
     """A CSV file in place of `times` and `values`. It has a column time [s], and columns x, y and z, or tilt, or tilt_x
     and tilt_z, with units. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
-    """Interpolation between the times: linear, or a cubic spline with zero slope at both ends."""
+    """Interpolation between the times: linear, or by a cubic spline with zero slope at both ends."""
     ramp: Ramp | None = None
-    """Duration of the ramp [s]. During the ramp the values grow smoothly (C2)."""
+    """Duration of the ramp at the start [s]. During the ramp the values grow smoothly (twice differentiable)."""
     _dimension: int = PrivateAttr(0)
 
     @model_validator(mode="after")
@@ -58,7 +59,7 @@ class Course(Table):
 
     @property
     def knots(self) -> Knots:
-        """Return the values (k, components) over time. Raise `InputError` for an invalid file."""
+        """Return the values (k, components) over time as a curve. Raise `InputError` for an invalid file."""
         if self.file is None:
             times, values = np.array(self.times), np.array(self.values, dtype=np.float64)
         else:
@@ -127,7 +128,7 @@ Schedule: Any = create_model(
     "Schedule", __base__=_Schedule, __module__=__name__, __doc__=vars(_Schedule)["__doc__"], **_COURSES
 )
 AXES = ("turn_x", "turn_y", "turn_z")
-"""Suffixes of the rotation fields of a free body."""
+"""Endings of the names of a free body's rotation fields."""
 RESTITUTION = 0.6
 
 
@@ -136,8 +137,8 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the number of each solid by name: 0, 1, ... for moving solids, and -2, -3, ... for solids at rest. Wall
-    particles store these numbers."""
+    """Return the number of each solid by its name. Moving solids have the numbers 0, 1, ..., and solids at rest have
+    -2, -3, .... Wall particles store these numbers."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
@@ -153,15 +154,16 @@ def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the initial positions (k, d) [m] of the middles of moving solids, and their rotation matrices (k,
-    d, d)."""
+    """Return the initial positions (k, d) [m] of the middles of k moving solids, and their initial rotation matrices
+    (k, d, d)."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """Return the greatest speed of a point on the solids [m/s]. Parameters in ``values`` replace the scene's."""
+    """Return the greatest speed of any point on the solids [m/s]. Parameters in ``values`` replace the parameters of
+    the scene."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
@@ -174,8 +176,8 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """Return an upper bound on the radius of a solid about its middle [m]. Parameters in ``values`` replace the
-    scene's."""
+    """Return an upper bound on the distance of a solid's points from its middle [m]. Parameters in ``values`` replace
+    the parameters of the scene."""
     furthest = np.abs(solid.own_solid().extent()).max(axis=0)
     return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
@@ -183,13 +185,13 @@ def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
 position_name = ending("position")
 """Parameter: initial position of the solid's middle [m]. Field: current position."""
 rotation_name = ending("rotation")
-"""Parameter and field: initial rotation [rad]."""
+"""Name of a parameter and of a state field: initial rotation of a solid [rad]."""
 scale_name = ending("scale")
-"""Parameter and field: factor of the solid's size."""
+"""Name of a parameter and of a state field: scale factor of the solid's size."""
 displacement_name = ending("displacement")
-"""Parameter: displacement of the solid's middle since the start [m]."""
+"""Name of a parameter: displacement of the solid's middle since the start [m]."""
 turn_name = ending("turn")
-"""Parameter and field: rotation since the start [rad]."""
+"""Name of a parameter and of a state field: rotation of a solid since the start [rad]."""
 velocity_name = ending("velocity")
 """Parameter: velocity of the solid's middle, for a free body at the start [m/s]. Field: velocity of a free body."""
 angular_velocity_name = ending("angular_velocity")
@@ -197,19 +199,20 @@ angular_velocity_name = ending("angular_velocity")
 density_name = ending("density")
 mass_name = ending("mass")
 friction_name = ending("friction")
-"""Parameter: coefficient of friction of a free body [-]."""
+"""Name of a parameter: coefficient of friction of a free body [-]."""
 restitution_name = ending("restitution")
-"""Parameter: coefficient of restitution of a free body [-]."""
+"""Name of a parameter: coefficient of restitution of a free body [-]."""
 
 
 def weight_name(solid: SolidTable) -> str:
-    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg]. The body's table has one of the
-    two."""
+    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg]. The table of the body has either
+    a density or a mass."""
     return (density_name if solid.mass is None else mass_name)(solid.name)
 
 
 def mass_of_one(solid: SolidTable) -> Mass:
-    """Return the mass and inertia of a free body for a density of 1, or for a mass of 1 if its table has a mass."""
+    """Return the mass and inertia of a free body with the density 1. If the table of the body has a mass, return them
+    for the mass 1."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
     if solid.inertia is not None:
@@ -230,7 +233,7 @@ def solids_in(fields: Iterable[str]) -> list[str]:
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
     """Return the parameters of moving solids.
 
-    Solids with prescribed motion have parameters for pose, size and motion. Rigid bodies have parameters for initial
+    Solids with prescribed motion have parameters for pose, size and motion. Free bodies have parameters for initial
     motion, density or mass, friction and restitution.
     """
     known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
@@ -285,7 +288,7 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
 
 
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """Return the displacement [m] and the rotation [rad] over time of a solid with prescribed motion."""
+    """Return two curves over time for a solid with prescribed motion: its displacement [m] and its rotation [rad]."""
     d = len(solid.middle())
     times, shifts, turns = path_of(solid, d) or (None, None, None)
 
@@ -301,25 +304,27 @@ def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a moving solid. Its rotation matrix (3, 3) is the product of `turned` and the initial rotation."""
+    """Pose of a moving solid. The rotation matrix (3, 3) of the pose is `turned` times the matrix of the initial
+    rotation."""
 
     name: str
     is_free: bool
-    """True for a free body that the fluid moves, False for prescribed motion."""
+    """True for a free body, False for a solid with prescribed motion."""
     position: NDArray[Any]
     """Position of the solid's middle (d,) [m]."""
     scale: float
-    """Factor of the solid's size."""
+    """Scale factor of the solid's size."""
     begun: NDArray[Any]
-    """Rotation vector of the initial rotation (3,) [rad]."""
+    """Rotation vector of the solid at the start (3,) [rad]."""
     turn: NDArray[Any]
-    """Rotation vector since the start (3,) [rad]; 0 for a free body."""
+    """Rotation vector of the rotation since the start (3,) [rad]; 0 for a free body."""
     turned: NDArray[Any]
-    """Rotation matrix since the start (3, 3)."""
+    """Rotation matrix of the rotation since the start (3, 3)."""
 
     @classmethod
     def of(cls, name: str, is_free: bool, at: Any) -> Self:
-        """Read the pose of a solid from the fields ``at`` of a state. The arrays have a first axis of length 1."""
+        """Read the pose of a solid from the fields ``at`` of a state. Each field is an array with a first axis of
+        length 1."""
         position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
         if is_free:
             turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
@@ -334,18 +339,19 @@ class Pose:
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """Rotation vector of the pose (3,), in 2-D its angle (1,), from -pi to pi [rad]."""
+        """Rotation vector of the pose (3,) [rad]. In 2-D, the angle of rotation (1,) from -pi to pi [rad]."""
         from scipy.spatial.transform import Rotation
 
         return np.asarray(_angles(Rotation.from_matrix(self.rotation).as_rotvec(), len(self.position)).ravel())
 
     def angle_bars(self, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return derivatives with respect to fields by name, given the derivative ``bar`` with respect to `angles`."""
+        """Return the derivatives with respect to state fields, by field name. ``bar`` is the derivative with respect to
+        `angles`."""
         return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return derivatives with respect to fields by name, given the derivative ``t`` (3,) with respect to a small
-        further rotation."""
+        """Return the derivatives with respect to state fields, by field name. ``t`` (3,) is the derivative with respect
+        to a small additional rotation."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:
@@ -355,7 +361,7 @@ class Pose:
 
 
 def matrix(rotation: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the rotation matrix (3, 3) of a rotation vector (3,), or of an angle (1,) in 2-D [rad]."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,) [rad], or of an angle (1,) [rad] in 2-D."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_rotvec(_in_space(rotation)).as_matrix())
@@ -371,7 +377,7 @@ def _angles(w: NDArray[Any], dimension: int) -> NDArray[np.float64]:
 
 
 def _jacobian(w: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the left Jacobian (3, 3) of the rotation vector w (3,)."""
+    """Return the left Jacobian (3, 3) of the rotation group SO(3) at the rotation vector ``w`` (3,)."""
     size, cross = float(np.linalg.norm(w)), np.cross(np.eye(3), w)
     if size < 1e-4:
         return np.asarray(np.eye(3) + 0.5 * cross + cross @ cross / 6.0)

@@ -1,7 +1,7 @@
 """Solvers and forces of installed packages for scene files.
 
-Packages register solvers and forces by entry points. Entry points are read only for a kind that Cortado does not have.
-Error messages begin with the name of the package.
+Packages register solvers and forces by entry points. Cortado reads entry points only if a scene names a kind that
+Cortado does not have. Error messages begin with the name of the package.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -43,10 +43,10 @@ def _in_words(problem: BaseException, package: str) -> str:
 def guarded(
     what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Convert an error in a package to an ``error`` with a message that begins with ``what``.
+    """Convert an exception in a package to the exception class ``error``. The new message begins with ``what``.
 
-    Errors of Cortado, keyboard interrupts and ``expected`` errors pass unchanged. Attempts to end the process are
-    converted.
+    Errors of Cortado, keyboard interrupts and ``expected`` exceptions pass unchanged. If the package tries to end the
+    process, an ``error`` is raised as well.
     """
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
@@ -58,7 +58,7 @@ def guarded(
 
 
 class PackageMaker:
-    """A solver or force of an installed package. Its error messages name the package."""
+    """A solver or force of an installed package. Error messages name the package."""
 
     def __init__(self, part: Any, kind: str, package: str):
         """Wrap ``part``, a solver or force. ``kind`` is its name in scene files, and ``package`` the name of the
@@ -109,7 +109,6 @@ def _at_work(made: Any, kind: str, package: str) -> Any:
 
 @cache
 def _guarded_class(cls: type, kind: str, package: str) -> type:
-    """Make a subclass with methods that convert errors. Methods inherited from Cortado stay unchanged."""
     if GUARDED in cls.__dict__:
         return cls
     own: dict[str, Any] = {"__slots__": (), "__module__": cls.__module__, GUARDED: True}
@@ -141,12 +140,12 @@ def _is_ours(function: Any) -> bool:
 
 MOST = 1_000_000_000
 TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, MOST)], bool: Flag, str: Text}
-"""Checks of keys by the type of a factory's argument."""
+"""Pydantic type that checks a key, for each type of a factory's argument."""
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
     """Return the entry point ``kind`` in a group such as "cortado.forces". Raise a `SceneError` if no package has
-    registered ``kind``, or if ``own`` contains the name."""
+    registered ``kind``, or if ``own``, the names that Cortado uses, contains ``kind``."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)

@@ -1,4 +1,4 @@
-"""Checks of parameter values, and the tilt of gravity, with NumPy in float64."""
+"""Checks of parameter values, and gravity as a function of tilt angles. All computations use NumPy in float64."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,19 +36,20 @@ def reference_density_adjoint(
 
 
 SMALL = 1e-2
-"""Angle below which a series is used in place of a division by the angle [rad]."""
+"""Smallest angle by which a formula divides [rad]. Smaller angles use a series."""
 
 
 @dataclass(frozen=True)
 class Tilt:
     """Gravity as a function of tilt angles (d - 1,) [degrees].
 
-    Gravity along -y turns towards x by the first angle and towards z by the second angle. The map is the exponential
-    map of the sphere. It is smooth also without tilt, and invertible for angles below 180 degrees.
+    Gravity along -y turns towards x by the first angle and towards z by the second angle. The function is the
+    exponential map of the sphere. The exponential map is smooth at zero tilt, and invertible for angles below 180
+    degrees.
     """
 
     rest: tuple[float, ...]
-    """Gravity without tilt (d,) [m/s2], not 0."""
+    """Gravity without tilt (d,) [m/s2]. The vector must not be zero."""
 
     def gravity(self, angles: np.ndarray) -> np.ndarray:
         """Return gravity (d,) or (steps, d) [m/s2] for angles (d - 1,) or (steps, d - 1) [degrees]."""
@@ -91,7 +92,8 @@ class Tilt:
 
     @staticmethod
     def _factors(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return sin|a| / |a| (..., 1) for the angles a, and its derivative with respect to |a|, divided by |a|."""
+        """Return the factor sin|a| / |a| (..., 1) for angles a. Also return the derivative of the factor with respect
+        to |a|, divided by |a|."""
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
         derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
@@ -104,8 +106,12 @@ class Known(FixedDict):
     __eq__, __ne__, __hash__ = object.__eq__, object.__ne__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """Add the parameters ``own`` of forces and a solver, each with a description of the force or solver. Raises
-        `InputError` if two parameters have the same name, or if a name is reserved. `TIME` may occur several times."""
+        """Add ``own``, the parameters of forces and of a solver. Each parameter in ``own`` comes with a description of
+        its force or solver.
+
+        Raises `InputError` if two parameters have the same name, or if a name is reserved. The parameter `TIME` may
+        occur several times.
+        """
         self._given = dict(own)
         found, arguments = dict(BY_NAME), {argument(name): name for name in BY_NAME}
         for parameter, whose in self._given.items():
@@ -119,7 +125,7 @@ class Known(FixedDict):
         super().__init__(found)
         self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
-        """Names of parameters of the time steps."""
+        """Names of parameters that the time steps use."""
         self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
         """Names of parameters of the initial state."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
@@ -133,7 +139,7 @@ class Known(FixedDict):
         return Known, (tuple(self._given.items()),)
 
     def has_rows(self, name: str, value: Any) -> bool:
-        """Test if a value has an entry for each step or each given time."""
+        """Test if the value of a parameter is an array over time steps or over given times."""
         parameter = self[name]
         return parameter.axis is Axis.STEP and np.ndim(value) == parameter.rank + 1
 
@@ -149,7 +155,7 @@ class _Passing:
 TIME = Parameter(
     "time", "s", "when a step begins", Axis.STEP, lambda source: 0.0, role=Role.CLOCK, moment=0.0, course=_Passing()
 )
-"""Parameter for forces that depend on time. Kernels read it from an array (members, steps)."""
+"""The time as a parameter of forces. Kernels read the time from an array (members, steps)."""
 
 
 def argument(name: str) -> str:
@@ -164,11 +170,12 @@ NAMES = names()
 UNITS = {name: parameter.unit for name, parameter in BY_NAME.items()}
 OVER_TIME = names(axis=Axis.STEP)
 SUM_TOLERANCE = 0.01
-"""Tolerance of the sum of a particle's mass fractions."""
+"""Greatest difference between 1 and the sum of a particle's mass fractions."""
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Return the scene's values of the ``known`` parameters, without alternatives such as a tilt."""
+    """Return the values of the ``known`` parameters in a scene. Alternative parameters, such as a tilt, are
+    left out."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():
@@ -213,8 +220,8 @@ def checked_value(
 ) -> np.ndarray:
     """Return a value as a float64 array, after a check of its shape and range.
 
-    Raise `OutOfRangeError` if only the numbers are invalid, else `InputError`. Numbers may be negative if ``what`` is
-    "direction".
+    Raise `OutOfRangeError` if the shape is valid but a number is out of range. Raise `InputError` for any other error.
+    Numbers may be negative if ``what`` is "direction".
     """
     array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""

@@ -66,13 +66,13 @@ class Parameter:
     axis: Axis
     value: Callable[[Source], Any]
     components: Callable[[int, int], int] | None = None
-    """Function from the numbers of dimensions and phases to the number of components; None for a scalar."""
+    """Function that returns the number of components, given the numbers of dimensions and phases; None for a scalar."""
     role: Role = Role.RUN
     range: Range = Range.ANY
     change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
-    """Function from a scene and a value to the size of a typical change."""
+    """Function that returns the size of a typical change of the parameter, given a scene and the parameter's value."""
     acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
-    """Function from a scene and parameter values by name to True if the parameter has an effect."""
+    """Function that tells if the parameter has an effect, given a scene and all parameter values by name."""
     present: Callable[[Any], bool] = lambda scene: True
     absent: str = ""
     """Reason why a scene may lack the parameter, such as "has only one phase"."""
@@ -82,18 +82,18 @@ class Parameter:
     """True for a parameter of an optional force."""
     longest_step: Limit = lambda scene, values: inf
     moment: float = 0.5
-    """Time within a step at which values over time are read, from 0 for its start to 1 for its end."""
+    """Instant within a time step at which a time-dependent value is read: 0 is the start of the step, 1 the end."""
     grows: bool = False
-    """True for a displacement from the start of a run."""
+    """True if the parameter is a displacement since the start of a run."""
     in_place_of: str | None = None
     """Name of the parameter that this alternative parameter replaces."""
     course: Changing | None = None
-    """Default values over time."""
+    """Default values of the parameter as a function of time."""
     shape: tuple[int, ...] = ()
 
     @property
     def rank(self) -> int:
-        """Number of axes of a single value, such as 1 for a vector."""
+        """Number of array axes of one value: 0 for a scalar, 1 for a vector."""
         return 0 if self.components is None else 1
 
     def shapes(self, steps: int, phases: int, positions: tuple[int, ...]) -> list[tuple[int, ...]]:
@@ -114,7 +114,7 @@ def _vector(dimension: int, phases: int) -> int:
 
 
 def of_part(name: str, unit: str, meaning: str, value: Any, axis: Axis = Axis.SCALAR, **more: Any) -> Parameter:
-    """Build the parameter of a part of a scene, such as a solid."""
+    """Build a parameter that belongs to one object of a scene, such as a solid."""
     own = np.asarray(value, dtype=np.float64)
     return Parameter(name, unit, meaning, axis, lambda source: own, components=_vector if own.ndim else None, **more)
 
@@ -143,7 +143,6 @@ def _of_particles(name: str, unit: str, meaning: str, value: Callable[[Source], 
 
 
 def _of_phases(name: str, unit: str, meaning: str, key: str = "", **more: Any) -> Parameter:
-    """Build a parameter from a key of the phases."""
     of_each = attrgetter(key or name)
     return Parameter(name, unit, meaning, Axis.PHASE, lambda s: list(map(of_each, s.scene.phase)), **more)
 
@@ -283,8 +282,8 @@ NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return scalar values (..., n) unchanged, or the norms of vectors (..., n, k). ``name`` is a quantity or
-    a field."""
+    """Return scalar values (..., n) unchanged, or the norms of vectors (..., n, k). ``name`` is the name of a particle
+    quantity or of a field of the state."""
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
@@ -298,7 +297,8 @@ LOAD = ".load"
 
 
 def load_name(solid: str) -> str:
-    """Return the name of a fluid load on a solid: force [N] and torque [N m], in 2-D [N/m] and [N]."""
+    """Return the name of the fluid load on ``solid``, such as "rotor.load". A load is a force [N] and a torque [N m],
+    in 2-D [N/m] and [N]."""
     return f"{solid}{LOAD}"
 
 
@@ -308,12 +308,13 @@ def is_load(name: object) -> bool:
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """Return ``name`` if it is a quantity, one of ``fields``, or a load on a solid; else raise `InputError`."""
+    """Return ``name`` if it names a quantity, one of ``fields``, or a load on a solid. Raise `InputError` for any other
+    name."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
-    """Return ``name`` if it is a quantity or one of ``others``; else raise `InputError`."""
+    """Return ``name`` if it names a quantity or is one of ``others``. Raise `InputError` for any other name."""
     if not isinstance(name, str) or name not in (*others, *NAMES):
         raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
     return name

@@ -1,9 +1,9 @@
 """Reads points from NumPy files and from the formats of VTK.
 
-VTK and HDF5 trust the contents of a file: a damaged file may make them hang, use all memory or crash. A separate
-process, ``python -m cortado.scene.point_files FILE``, therefore reads VTK and HDF5 files within limits. The process
-writes the points (n, 3) or (n, 2) in NumPy's format to standard output. If it refuses a file, it writes the reason and
-ends with the exit code `REFUSED`.
+The libraries VTK and HDF5 trust the contents of a file. A damaged file may make them hang, use all memory or crash. A
+separate process with limited time and memory, ``python -m cortado.scene.point_files FILE``, therefore reads such files.
+The process writes the points (n, 3) or (n, 2) in NumPy's format to standard output. If the process refuses a file, it
+writes the reason and ends with the exit code `REFUSED`.
 """
 
 import io
@@ -26,7 +26,7 @@ from cortado.files.disk import cached_by_file, reason
 MOST_POINTS = 10_000_000
 REFUSED = 3
 ROOM = 2**30
-"""Additional memory for the reading process, besides 20 times the size of the file [byte]."""
+"""Constant part of the reading process's memory limit [byte]. The limit also includes 20 times the size of the file."""
 
 
 class Refused(Exception):
@@ -125,7 +125,7 @@ def main(path: str) -> int:
 SUFFIXES = (".npy", *READERS)
 MOST_POINT_BYTES = 2**30
 SECONDS, BYTES_PER_SECOND = 15.0, 5e6
-"""Fixed part of the time limit for reading a file [s], and number of bytes per additional second [byte/s]."""
+"""The time limit for reading a file is ``SECONDS`` [s] plus the file size divided by ``BYTES_PER_SECOND`` [byte/s]."""
 
 
 def read_points(path: str, dimension: int) -> Points:

@@ -1,4 +1,4 @@
-"""States from which a later run continues exactly (bit for bit), and their times."""
+"""States that a later run can continue exactly (bit for bit), and the times of such states."""
 
 import json
 from collections.abc import Mapping
@@ -53,7 +53,8 @@ class RecordedClock(Clock):
 
 @dataclass(frozen=True)
 class Origin:
-    """Properties of the scene that made a state. A run from the state needs a scene with equal properties."""
+    """Properties of the scene in which a state was computed. A run can start from the state only in a scene with equal
+    properties."""
 
     spacing: float
     """Particle spacing [m]."""
@@ -87,9 +88,11 @@ class RestartState(ShortRepr):
     fields: Mapping[str, NDArray]
     """Arrays by field name.
 
-    These are positions (n, d) [m], velocities (n, d) [m/s], mass_fractions (n, phases), and reference_density (n,), the
-    mass of a particle divided by its volume on the rest lattice [kg/m3]. For each emitter, NAME.outlet (1, d) is the
-    position of its opening [m], and NAME.emitted (1,) the length of the emitted column [m]. Some solvers add fields.
+    The arrays are positions (n, d) [m], velocities (n, d) [m/s], mass_fractions (n, phases), and reference_density (n,)
+    [kg/m3]. The reference density is the mass of a particle divided by its volume on the rest lattice.
+
+    An emitter with the name NAME has two more arrays. NAME.outlet (1, d) is the position of its opening [m].
+    NAME.emitted (1,) is the length of the emitted column [m]. Some solvers add fields.
     """
     clock: Clock = field(default_factory=Clock)
     """Time of the state."""

@@ -76,8 +76,9 @@ class Scene(SceneTables):
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
         """Return the scene with enough fluid in its emitters for ``time`` [s], or for ``steps`` steps.
 
-        An emitter is unchanged if it has a volume, is fed by drains, or has a long enough column. The scene is
-        unchanged if all axes are periodic. Raises `InputError` if the particles would not fit into memory.
+        An emitter is unchanged if the scene gives its volume, if drains feed it, or if its column of fluid is long
+        enough. The scene is unchanged if all axes are periodic. Raises `InputError` if the particles would not fit into
+        memory.
         """
         spacing = self.discretisation.spacing
         if steps is not None:
@@ -94,7 +95,7 @@ class Scene(SceneTables):
         return self.model_copy(update={"emitter": lasting})
 
     def going_on(self, state: RestartState) -> "Scene":
-        """Return the scene with as much fluid in emitters as in the run that made ``state``."""
+        """Return the scene with at least as many particles in each emitter as in the run that computed ``state``."""
         origin, spacing, made = state.origin, self.discretisation.spacing, list(self.emitter)
         if origin is None or len(origin.waiting) != len(made):
             return self
@@ -124,8 +125,8 @@ class Scene(SceneTables):
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
-        """Read a scene from the JSON of `to_json`, with overrides as for `load_scene`. Errors refer to the scene as
-        ``file``."""
+        """Read a scene from the JSON of `to_json`, with overrides as for `load_scene`. Error messages use ``file`` as
+        the name of the scene file."""
         if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
@@ -170,11 +171,11 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
     """Read a scene from a TOML file.
 
     Args:
-        path: the file, whose tables [problem], [optimise] and [fit] are ignored.
+        path: the scene file. Its tables [problem], [optimise] and [fit] are ignored.
         overrides: replacements such as ``solver.time_step=0.002`` or ``fluid[0].upper=[1,1,1]``.
 
     Raises:
-        SceneError: one sentence with the file, the field, the value found and the allowed values.
+        SceneError: the file is invalid. The message names the file, the field, the value found and the allowed values.
 
     Example: ``scene = cortado.load_scene("dam.toml", ["solver.time_step=0.001"])``
     """
@@ -204,7 +205,8 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """Return all tables with a key for a file, each with the name of the key. ``tables`` are as in `Scene.to_json`."""
+    """Return all tables of a scene that name a file, each with the key of the file name. ``tables`` are as in
+    `Scene.to_json`."""
     found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
     found += [one["path"] for one in tables.get("emitter") or ()]
     return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
@@ -247,12 +249,12 @@ _KEY = re.compile(r"[A-Za-z0-9_-]+(\[\d+\])*(\.[A-Za-z0-9_-]+(\[\d+\])*)*")
 def read_toml(
     path: str | os.PathLike[str], overrides: Sequence[str] = (), unread: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Read a TOML file and return its contents with overrides applied. Raises `SceneError`. Tables in ``unread`` cannot
-    be overridden.
+    """Read a TOML file and return its contents with overrides applied. Raises `SceneError` if the file or an override
+    is invalid. Tables in ``unread`` cannot be overridden.
 
     An override is ``key=value``, such as ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or
     ``fluid[0].upper=[1,1,1]``. A list entry can be given by its name in place of its index:
-    ``phase.oil.viscosity=0.1``. A value that is not TOML becomes text.
+    ``phase.oil.viscosity=0.1``. A value that is not valid TOML is read as text.
     """
     file = as_path("path", path)
     try:

@@ -29,7 +29,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Yield the field ``names`` that do not have their default values."""
+    """Yield each of the field ``names`` for which the table has a value other than the default."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -51,7 +51,7 @@ def idle_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 Idle = tuple[FieldPath, Table, tuple[str, ...], str]
-"""Path of a table, the table, the names of keys without effect, and the reason."""
+"""A table with keys that have no effect: the table's path, the table, the names of the keys, and the reason."""
 
 
 def _idle(scene: SceneTables) -> Iterator[Idle]:
@@ -135,7 +135,8 @@ def creep_sentence(scene: SceneTables) -> str | None:
 
 
 def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
-    """Return a warning about the inaccurate pairwise viscosity, or None. ``where`` tells where the error matters."""
+    """Return a warning about the inaccurate pairwise viscosity, or None. The text ``where`` begins the warning and
+    names what the error affects."""
     if scene.forces.viscosity != "pairwise":
         return None
     fault = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
@@ -143,9 +144,9 @@ def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
 
 
 THROUGH = 1.5
-"""Smallest extension of a solid through a wall [spacings]."""
+"""Recommended length of a moving solid beyond a container wall that the solid crosses [spacings]."""
 FACING = 0.9
-"""Smallest component of a unit normal along an axis for a face perpendicular to the axis."""
+"""A face counts as perpendicular to an axis if the axis component of its unit normal is greater than this number."""
 
 
 def standing_sentences(scene: SceneTables) -> Iterator[str]:
@@ -183,11 +184,12 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
 """Smallest thickness of a leak-proof solid, for one and for two layers of wall particles [spacings]."""
 DEPTHS = np.arange(1, 9) / 8.0
-"""Test depths below the surface of a solid, as fractions of the smallest thickness."""
+"""Depths below the surface of a solid at which its thickness is tested, as fractions of the smallest allowed
+thickness."""
 MARGIN = 1e-3
-"""Tolerance of the thickness, as a fraction of the smallest thickness."""
+"""Tolerance of the thickness, as a fraction of the smallest allowed thickness."""
 SHARE = 0.01
-"""Fraction of the surface that may be too thin without a warning."""
+"""Fraction of a solid's surface that may be above too thin walls without a warning."""
 
 
 def thin_sentences(scene: SceneTables) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Texts about the keys of tables, from their JSON schema: valid values, units and help."""
+"""Descriptions of the keys of tables, made from JSON schemas: valid values, units and help."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,7 +18,7 @@ else:
     ModelMetaclass = type(BaseModel)
 
 GREATEST = 1e50
-"""Greatest number in a scene. Its inverse is the smallest positive number."""
+"""Greatest number that a scene may contain. The smallest positive number is 1 / ``GREATEST``."""
 Schema = Mapping[str, Any]
 
 

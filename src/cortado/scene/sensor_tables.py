@@ -1,4 +1,4 @@
-"""Tables of sensors, which record numbers of a run in every step."""
+"""Tables of sensors. A sensor records measured values in every time step."""
 
 import unicodedata
 from typing import Annotated, Literal
@@ -13,10 +13,10 @@ Axes = Literal["world", "body"]
 
 
 class SensorTable(Table):
-    """A sensor that records numbers of the fluid in every step."""
+    """A sensor that records measured values in every time step."""
 
     name: Text
-    """Name of the sensor. The names of its columns in sensors.csv begin with it."""
+    """Name of the sensor. Column names in sensors.csv begin with the name of the sensor."""
 
     @field_validator("name")
     @classmethod
@@ -52,7 +52,7 @@ class WaveGaugeTable(SensorTable):
     """Height of the column's lower end [m], measured upwards against gravity; usually the height of the container's
     bottom."""
     radius: Reach = None
-    """Radius of the column [m]. If left out, two support radii, but at least five spacings."""
+    """Radius of the column [m]. The default is two support radii, but at least five spacings."""
     on: Text | None = None
     """Name of a moving solid that carries the column along."""
     axes: Axes = "world"
@@ -70,7 +70,7 @@ class FlowRateTable(SensorTable):
     normal: Direction
     """(d,) Direction of positive flow."""
     reach: Reach = None
-    """Half the thickness of the measured layer of fluid [m]. If left out, two support radii, but at least five
+    """Half the thickness of the measured layer of fluid [m]. The default is two support radii, but at least five
     spacings."""
 
 

@@ -24,7 +24,7 @@ from cortado.scene.tables import Colour, Flag, Length, OneOf, Table, Text, Vecto
 
 INDEX_OF_AXIS = {"x": 0, "y": 1, "z": 2}
 THIN = 2.5
-"""Greatest thickness of a part of a mesh that counts as a sheet [spacings]."""
+"""Greatest thickness of a thin sheet in a mesh [spacings]."""
 
 
 def _beside_scene(file: str, info: ValidationInfo) -> str:
@@ -39,7 +39,7 @@ File = Annotated[Text, AfterValidator(_beside_scene)]
 
 
 class Ordered(Table):
-    """A table with corners of which each component of `lower` is less than that of `upper`."""
+    """A table with two corners. Each component of `lower` must be less than the same component of `upper`."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -68,9 +68,9 @@ class SphereShape(Table):
 
     shape: Literal["sphere"] = "sphere"
     centre: Vector[Length]
-    """(d,) Middle [m]."""
+    """(d,) Centre of the sphere or disc [m]."""
     radius: Annotated[float, quantity("m", gt=0.0)]
-    """Distance from the middle to the surface [m]."""
+    """Radius of the sphere or disc [m]."""
 
     def shape_about(self) -> tuple[Solid, Points]:
         return Round(np.zeros(len(self.centre)), self.radius), np.array(self.centre)
@@ -87,7 +87,7 @@ class CylinderShape(Table):
     height: Annotated[float, quantity("m", gt=0.0)]
     """Length along the axis, from the base [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """Axis of space along which the cylinder stands, before a rotation."""
+    """Coordinate axis parallel to the cylinder's axis, before a rotation."""
 
     @property
     def along(self) -> int:
@@ -130,7 +130,7 @@ class MeshShape(Table):
     file: File
     """Name of an STL, OBJ, PLY, glTF or GLB file. A relative path starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor of all lengths in the file, such as 0.001 for millimetres."""
+    """Factor that converts lengths in the file to metres, such as 0.001 for millimetres."""
 
     def shape_about(self) -> tuple[Mesh, Points]:
         return _about_middle(mesh_in_file(self.file), self.scale)
@@ -158,7 +158,8 @@ def surface_cells(lower: Points, upper: Points, spacing: float) -> float:
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:
-    """Return the indices of two crossing sides of a polygon, or None. A side of length 0 is returned twice."""
+    """Return the indices of two crossing sides of a polygon, or None. If a side has length 0, its index is returned
+    twice."""
     count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
 
     def turned(a: Points, b: Points) -> float:
@@ -204,19 +205,21 @@ class Container(Table):
         return np.zeros((0, dimension))
 
     def places(self, dimension: int, spacing: float, reach: float) -> Places:
-        """Return places for fluid that are less than ``reach`` [m] from a wall."""
+        """Return points where fluid may rest, at distances less than ``reach`` [m] from a wall."""
         return Places.upright(np.zeros((0, dimension)))
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """Return a shorter container with the same weights of wall particles. ``spacing`` and ``support`` are in
+        """Return a shorter container with wall particles of the same weights. ``spacing`` and ``support`` are in
         metres.
 
-        Also return a function that maps points (b, d) [m] on the walls of the container to the shorter container.
+        Also return a function that maps points (b, d) [m] on the walls of this container to points on the walls of the
+        shorter container.
         """
         return self, lambda points: points
 
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        """Return the solids that form the walls of the container. ``reach`` [m] extends the solids at periodic ends."""
+        """Return the solids that form the walls of the container. At periodic ends the solids are extended by ``reach``
+        [m]."""
         return ()
 
     def wall_count(self, spacing: float) -> float:
@@ -224,7 +227,7 @@ class Container(Table):
         return 0.0 if ends is None else surface_cells(*ends, spacing)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Return the lower corner and the lengths of the periodic box, each (d,) [m]. The length is 0 along an axis
+        """Return the lower corner (d,) [m] and the lengths (d,) [m] of the periodic box. The length is 0 along an axis
         that is not periodic."""
         return np.zeros(dimension), np.zeros(dimension)
 

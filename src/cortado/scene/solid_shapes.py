@@ -133,7 +133,7 @@ class CupSolid(SolidTable):
     thickness: Size
     """Thickness of the side and the bottom [m]."""
     axis: Literal["x", "y", "z"] = "y"
-    """Axis of space along which the cup stands, before a rotation. In 2-D the cup stands along y."""
+    """Coordinate axis parallel to the cup's axis, before a rotation. In 2-D the axis is y."""
 
     @model_validator(mode="after")
     def _check_height(self) -> Self:
@@ -187,8 +187,8 @@ FLAT = 1e-6
 
 
 class SheetSolid(SolidTable):
-    """A wall without thickness that separates the fluids on its two sides. In 2-D it is a line of straight parts. In
-    3-D it is a flat convex polygon, or the open mesh of a file."""
+    """A wall without thickness that separates the fluids on its two sides. In 2-D a sheet is a line of straight
+    segments. In 3-D a sheet is a flat convex polygon, or an open mesh from a file."""
 
     measures: ClassVar = ("scale",)
     least_thickness: ClassVar = 0.0
@@ -203,7 +203,7 @@ class SheetSolid(SolidTable):
     """File of a mesh in 3-D, in place of `corners`: STL, OBJ, PLY, glTF or GLB. The mesh may be open. A relative path
     starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
-    """Factor of all lengths in the file, such as 0.001 for millimetres."""
+    """Factor that converts lengths in the file to metres, such as 0.001 for millimetres."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         turned = super().in_dimension(dimension, path)

@@ -30,8 +30,8 @@ class SolidTable(Coloured):
     position: OnAxes[Length] = None
     """(d,) Position of the centroid [m]; if left out, the shape's corners, centre or mesh determine it."""
     rotation: Turns[Angle] = None
-    """Initial rotation about the centroid [rad]; no rotation if left out. In 3-D a rotation vector, in 2-D one number,
-    counterclockwise."""
+    """Initial rotation about the centroid [rad]; no rotation if left out. The value is a rotation vector in 3-D, and a
+    counterclockwise angle in 2-D."""
     motion: Literal["fixed", "path", "free"] = "fixed"
     """How the solid moves. A "fixed" solid does not move. A "path" solid moves as `positions`, `rotations`, the file
     `path`, `velocity` or `angular_velocity` prescribe. A "free" solid is a rigid body that fluid and gravity move."""
@@ -45,12 +45,12 @@ class SolidTable(Coloured):
     """(3,) Radii of gyration of a free body about the axes of its frame [m], in 2-D one number. A radius of gyration is
     the square root of moment of inertia divided by mass. If left out, the body is homogeneous."""
     inertia: Inertia | None = None
-    """Moments of inertia of a free body about its centre of mass [kg m²], in place of `gyration_radius`. In 2-D one
-    number per metre of depth. In 3-D three numbers about the axes of the body's frame, or the nine entries of a matrix,
-    row by row."""
+    """Moments of inertia of a free body about its centre of mass [kg m²], in place of `gyration_radius`. In 2-D the
+    value is one moment of inertia per metre of depth. In 3-D the value contains three moments about the axes of the
+    body's frame, or the nine components of the inertia matrix, row by row."""
     freedom: tuple[Annotated[str, OneOf(sorted({*WAYS[2], *WAYS[3]}))], ...] | None = None
-    """Directions in which a free body can move, along the axes of space; all directions if left out. The names are "x",
-    "y" and "rotation", in 3-D "x", "y", "z", "rotation_x", "rotation_y" and "rotation_z"."""
+    """Directions in which a free body can move, along the axes of space; all directions if left out. In 2-D the names
+    are "x", "y" and "rotation". In 3-D the names are "x", "y", "z", "rotation_x", "rotation_y" and "rotation_z"."""
     friction: Annotated[float, quantity(ge=0.0)] | None = None
     """Coefficient of Coulomb friction of a free body at contacts; 0 if left out. Two free bodies in contact use the
     mean of their coefficients."""
@@ -62,11 +62,12 @@ class SolidTable(Coloured):
     positions: tuple[tuple[Length, ...], ...] | None = None
     """(k, d) Positions of the centroid at `times` [m]. The first position is the initial position."""
     rotations: tuple[Few[Angle], ...] | None = None
-    """(k, 3) Rotation vectors since the start at `times`, in 2-D angles (k,) [rad]. The first rotation is 0."""
+    """Rotations since the start of the run at `times` [rad]: rotation vectors (k, 3) in 3-D, angles (k,) in 2-D. The
+    first rotation is 0."""
     path: File | None = None
     """A CSV file in place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg]. In 3-D the
-    rotations are rotation_x [deg] and so on. Only differences from the first line matter. A missing column means 0. A
-    relative path starts at the scene file's folder."""
+    rotations are rotation_x [deg], rotation_y [deg] and rotation_z [deg]. Only differences from the first line matter.
+    A missing column counts as 0. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
     """Interpolation between `times`: linear, or a cubic spline. The spline has continuous velocity and acceleration,
     and velocity 0 at both ends."""
@@ -77,22 +78,22 @@ class SolidTable(Coloured):
     """(d,) Constant velocity of the solid's middle [m/s]; for a free body, the initial velocity of its centre
     of mass."""
     angular_velocity: Turns[Annotated[float, quantity("rad/s")]] = None
-    """Constant angular velocity about the solid's middle [rad/s]; for a free body, the initial angular velocity. In 3-D
-    a vector, in 2-D one number, counterclockwise."""
+    """Constant angular velocity about the solid's middle [rad/s]; for a free body, the initial angular velocity. The
+    value is a vector in 3-D, and one number in 2-D, positive for a counterclockwise rotation."""
     surface_velocity: OnAxes[Annotated[float, quantity("m/s")]] = None
     """(d,) Velocity of the sliding surface of a solid at rest, such as a conveyor belt, in the solid's frame [m/s]."""
     side: Literal["outside", "inside"] = "outside"
-    """Side of the shape for fluid: "outside", or "inside" for a tank."""
+    """Side of the solid's surface with the fluid: "outside", or "inside" for a tank."""
     slip: Literal["free", "no"] = "free"
     """"no" for a no-slip surface; "free" for a surface without viscous force."""
     material: Annotated[str, OneOf(tuple(FINISHES))] | None = None
     """Material of the solid in pictures, which sets its colour, transparency and reflections."""
     colour: Colour | None = None
-    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. If left out, the colour of the
+    """(3,) Colour in pictures: red, green and blue, each from 0 to 1, in linear light. The default is the colour of the
     material, or [0.55, 0.55, 0.58] without a material."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
-    """Fraction of the light that passes through the solid in pictures, from 0 to 1. If left out, the transparency of
-    the material. Without a material the default is 0, or 1 if fluid is inside."""
+    """Fraction of the light that passes through the solid in pictures, from 0 to 1. The default is the transparency of
+    the material. Without a material the default is 0, or 1 for a solid with fluid inside."""
 
     @property
     def finish(self) -> Finish:

@@ -11,20 +11,20 @@ from cortado.scene.packages import Inline, PackageTable
 from cortado.scene.tables import Flag, OrWord, Table, Text, count, field_error, quantity
 
 OWN = ("projection", "pcisph")
-"""Cortado's kinds of solvers. The first is the default."""
+"""Names of Cortado's solvers. The first solver is the default."""
 COURANT = 0.2
 """Default Courant number."""
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]
-"""Names of tables with default values for their keys."""
+"""Pairs of the name of a table and the default values of keys in this table."""
 
 
 class SolverTable(Table):
-    """Algorithm and time step."""
+    """The algorithm and the length of a time step."""
 
     kind: str
     """Name of the algorithm."""
     time_step: Annotated[float | Literal["auto"], OrWord(quantity("s", gt=0.0), "auto")]
-    """Length of a step [s]; "auto" chooses the length of each step before it."""
+    """Length of a step [s]. With "auto", the solver chooses the length anew before each step."""
     courant: Annotated[float, quantity(gt=0.0, le=1.0)] | None = None
     """Courant number of adaptive time steps; 0.2 if left out. The fastest particle moves at most this number of
     smoothing lengths in a time step. A smoothing length is half a support radius."""
@@ -69,15 +69,16 @@ class ProjectionSolver(SolverTable):
     iterations: Annotated[int, count(2, 1_000)] = 2
     """Number of pressure iterations in every step, or the minimum if `tolerance` is given."""
     tolerance: Annotated[float, quantity(gt=0.0)] | None = None
-    """Tolerance of the pressure iterations: root mean square of divergence times time step, inside the fluid. If left
-    out, every step has the same number of iterations."""
+    """Tolerance of the pressure iterations: greatest root mean square of divergence times time step, inside the fluid.
+    If left out, every step has the same number of iterations."""
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
     """Greatest number of pressure iterations in a step if `tolerance` is given."""
     repairs: Annotated[int, count(1, 1_000)] = 2
-    """Number of density iterations in every step. They move particles until the fluid has its rest density."""
+    """Number of density iterations in every step. Density iterations move particles until the fluid has its rest
+    density."""
     velocities_follow: Flag = False
-    """If true, velocities are corrected when a step shifts particles without their velocity. Flows in full containers
-    then lose less speed, but flows with a free surface can gain energy."""
+    """If true, velocities are adapted to the new positions when a step shifts particles. Flows in full containers then
+    lose less speed, but flows with a free surface can gain energy."""
     suits: ClassVar[Suits] = (
         ("discretisation", {"kernel": "wendland_c2", "support": 2.6}),
         ("emitter", {"jitter": 0.05}),
@@ -107,7 +108,7 @@ class PcisphSolver(SolverTable):
     """Maximum number of pressure iterations in a step."""
     density_tolerance: Annotated[float, quantity(ge=0.0)] = 0.01
     """Tolerance of the average density error of all particles. The error of a particle is (density - rest density) /
-    rest density, or 0 if this is negative."""
+    rest density; a negative error counts as 0."""
     maximum_density_tolerance: Annotated[float, quantity(ge=0.0)] | None = None
     """Tolerance of the greatest density error of a particle; no limit if left out."""
 

@@ -26,7 +26,7 @@ def greatest_fall(scene: SceneTables, gravity: Points) -> float:
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
     """Return the greatest energy per mass [J/kg] of fluid that falls to the lowest point of a solid, for gravity (k, d)
-    [m/s2]. Parameters in ``values`` replace the scene's.
+    [m/s2]. Parameters in ``values`` replace parameters of the scene.
 
     The fall begins at the highest point of initial fluid, free bodies and emitters. If gravity changes or the solid
     moves, the result is `greatest_fall`.
@@ -65,24 +65,24 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
-"""Function for the greatest viscous rate on a lattice, and safety factor of the time step, for each form of the viscous
-force."""
+"""For each form of the viscous force: the function for the greatest viscous rate on a lattice, and the safety factor of
+the time step."""
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
 """Factors of the time step limit for deep fluid, by smoothing kernel."""
 RESTING, RUNNING = 0.63, 0.4
-"""Factors of the time step limit for deep fluid with a coarse pressure grid. The first factor is for fluid that covers
-the floor of its container."""
+"""Factors of the time step limit for deep fluid with a coarse pressure grid. ``RESTING`` is for fluid that covers the
+floor of its container, ``RUNNING`` for other fluid."""
 SOLID_STEP = 0.2
 """Greatest motion of a solid in a time step [spacings]."""
 FRICTION_STEP = 0.25
-"""Greatest kinematic viscosity times time step beside no-slip free bodies [spacings²]."""
+"""Greatest product of kinematic viscosity and time step beside no-slip free bodies [spacings²]."""
 
 BESIDE, THROUGH = 0.4, 0.25
 """Greatest motion of fluid beside a solid in a time step: in spacings, and as a fraction of the solid's thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return upper bounds of adaptive time steps [s] by name. They do not depend on the speed of the fluid.
+    """Return upper bounds of adaptive time steps [s] by name. The bounds do not depend on the speed of the fluid.
 
     The bounds are `standing_limits` and the key ``greatest_time_step``. If gravity changes, `gravity_limits` bounds
     each time step separately.
@@ -109,7 +109,8 @@ def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """Return advice for a run that diverged with this time step [s]. Parameters in ``values`` replace the scene's."""
+    """Return advice for a run that diverged with this time step [s]. Parameters in ``values`` replace parameters of the
+    scene."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limits(scene, values, time_step)
@@ -120,29 +121,29 @@ def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> s
 
 
 def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return the stability limits of the time step [s] by name. A limit is infinite if it does not apply. In the
+    """Return the stability limits of the time step [s] by name. A limit that does not apply is infinite. In the
     formulas h is the support radius, s the spacing and g gravity.
 
     Courant: 0.4 h / v (Monaghan 1992). The speed v is the larger of the initial speed and the speed after a free fall
-    through the container. Emitters count as well.
+    through the container. Speeds of emitted fluid count as well.
 
     Solids: beside a solid, fluid moves at most 0.4 spacings in a time step, and at most a quarter of the solid's
     thickness.
 
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992).
 
-    Viscosity: a fraction of the longest stable explicit time step on a lattice; see `VISCOUS_RATES`. It uses the
-    greatest viscosity and the smallest density of the phases.
+    Viscosity: a fraction of the longest stable explicit time step on a lattice; see `VISCOUS_RATES`. The estimate uses
+    the greatest viscosity and the smallest density of the phases.
 
     Depth: C s^(3/2) / (H sqrt(|g|)) for fluid of depth H, where the factor C is from `DEPTH_FACTORS`. With a coarse
-    grid it is C s / sqrt(H |g|), where C is `RESTING` or `RUNNING`. In a tilted container, H is the depth in the lowest
-    corner.
+    pressure grid, the limit is C s / sqrt(H |g|), where C is `RESTING` or `RUNNING`. In a tilted container, H is the
+    depth in the lowest corner.
 
     Friction: 0.25 s^2 / nu for no-slip free bodies in fluid of kinematic viscosity nu.
 
     Moving solids move at most a fifth of a spacing in a time step, and fluid near a sink moves at most 0.4 spacings.
-    Optional forces have limits in the registry of parameters. Parameters in ``values`` replace the scene's parameters
-    and schedule. If gravity changes, its strongest value is used.
+    The registry of parameters contains the limits of optional forces. Parameters in ``values`` replace the scene's
+    parameters and schedule. If gravity changes during a run, the strongest gravity is used.
     """
     values = values or {}
     gravity, spacing = np.atleast_2d(values.get("gravity", _gravity(scene))), scene.discretisation.spacing
@@ -210,7 +211,7 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """Test if the viscous force is computed implicitly. Parameters in ``values`` replace the scene's."""
+    """Test if the viscous force is computed implicitly. Parameters in ``values`` replace parameters of the scene."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False

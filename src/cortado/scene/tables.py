@@ -46,7 +46,8 @@ def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None =
 
 
 def check_name(path: FieldPath, name: str | None, names: Sequence[str], kind: str, otherwise: str = "") -> None:
-    """Raise a `field_error` if a name is not in ``names``. The error says ``otherwise`` if ``names`` is empty."""
+    """Raise a `field_error` if a name is not in ``names``. If ``names`` is empty, the message contains
+    ``otherwise``."""
     if name not in names:
         raise field_error(path, name, f"the name of {kind}, of {shown(names)}" if names else otherwise)
 
@@ -63,14 +64,14 @@ def count(least: int, most: int) -> Any:
 
 
 def components(*names: str) -> Any:
-    """Describe a field for a list of named components, such as a colour."""
+    """Describe a field with a list of numbers, one for each named component, such as red, green and blue."""
     extra: Any = {"components": list(names)}
     return Field(min_length=len(names), max_length=len(names), fail_fast=True, json_schema_extra=extra)
 
 
 @dataclass(frozen=True)
 class OneOf:
-    """Marks a field for the name of an entry in a registry."""
+    """Marks a field that contains a name from a registry."""
 
     names: Collection[str]
 
@@ -80,7 +81,7 @@ class OneOf:
 
 @dataclass(frozen=True)
 class OrWord:
-    """Marks a field for a number or a special word such as "auto"."""
+    """Marks a field that contains a number or a special word such as "auto"."""
 
     number: Any
     """Description of the number, from `quantity`."""
@@ -101,7 +102,8 @@ class OrWord:
 Item = TypeVar("Item")
 PER_AXIS, PER_ROTATION = "per axis", "per rotation"
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
-"""A vector with one entry for each axis. In 2-D the default is the first two entries of the default in 3-D."""
+"""A vector with one component for each axis. In 2-D the default value is the first two components of the default in
+3-D."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
 Text = Annotated[str, Field(strict=True, pattern=r"\S")]
 Flag = Annotated[bool, Field(strict=True)]
@@ -144,7 +146,7 @@ Inertia = Annotated[tuple[Annotated[float, quantity("kg m2")], ...], _few(9), Be
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstrings of fields by name, with the fields of base classes. The result is empty if the source code
+    """Return the docstrings of fields by name, including fields of base classes. The result is empty if the source code
     is not available."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
@@ -253,7 +255,7 @@ def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """Return the part of a JSON schema at a location that pydantic reports, and the path of the field."""
+    """Return the JSON schema of a field and the path of the field, given a location in a pydantic error."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -298,13 +300,13 @@ ALSO_CALLED = {
 
 
 class Table(BaseModel, metaclass=Documented):
-    """A table of a scene. It is immutable and has no unknown keys. An invalid value raises a `SceneError`."""
+    """A table of a scene. Tables are immutable. An unknown key or an invalid value raises a `SceneError`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
-    """Tables of other modules that a file may contain."""
+    """Names of tables that a file may also contain, and that other modules read."""
     _instead: ClassVar[Mapping[int, str]] = {}
-    """Names of the shapes to use in 2 or 3 dimensions in place of a shape that does not exist there."""
+    """Names of shapes that replace this shape in 2 or 3 dimensions, if this shape does not exist there."""
 
     def __init__(self, /, **data: Any):
         with sentences(type(self)):
@@ -359,7 +361,8 @@ class Table(BaseModel, metaclass=Documented):
         return placed
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` if the vector in a field of ``names`` does not have ``dimension`` components."""
+        """Raise a `field_error` if a vector does not have ``dimension`` components. ``names`` are the fields with
+        vectors."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:

@@ -58,12 +58,12 @@ from cortado.sph.stress_forces import LAWS
 
 
 class ForceMaker(Protocol):
-    """Protocol of a maker of forces. It lists the parameters of the force, and makes the force for each solver of a
-    simulation.
+    """Protocol of a maker of forces. A maker lists the parameters of the force, and makes the force for each solver of
+    a simulation.
 
     The maker is pickled with the simulation. An optional text ``fingerprint`` identifies the maker when a search
-    resumes. An optional method ``check(values, simulation)`` raises `InputError` for impossible parameter values by
-    name.
+    resumes. An optional method ``check(values, simulation)`` gets parameter values by name, and raises `InputError` for
+    impossible values.
     """
 
     parameters: Sequence[Parameter]
@@ -149,8 +149,8 @@ class SolverSetting:
 class SolverMaker(Protocol):
     """Protocol of a maker of a solver. A simulation and all simulations derived from it use the same maker.
 
-    The maker is pickled with the simulation. Kernels read its optional ``parameters`` by name. An optional text
-    ``fingerprint`` identifies the maker. ``batches = True`` declares that its solver supports batches.
+    The maker is pickled with the simulation. Kernels read the maker's optional ``parameters`` by name. An optional text
+    ``fingerprint`` identifies the maker. ``batches = True`` declares that the solver supports batches.
     """
 
     def build(self, setting: SolverSetting) -> Solver:
@@ -196,7 +196,7 @@ def solver_named(table: SolverTable) -> SolverMaker:
 
 
 def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
-    """Return makers of the viscosity laws in a scene, and of forces from installed packages."""
+    """Return the makers of a scene's viscosity laws and of its forces from installed packages."""
     laws = [
         Rheology(LAWS[phase.rheology.kind], None, **phase.rheology.numbers(phase.viscosity))
         for phase in scene.phase

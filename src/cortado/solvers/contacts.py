@@ -1,29 +1,31 @@
 """Contacts of free bodies with the container, solids and each other: a smooth penalty with restitution and friction.
 
-At the predicted pose, points of a body's surface are inside the other solid by depths d_j > 0 along the normals n_j of
-the faces above them. The weights w_j = d_j^3 / sum d_j^3 give the contact the depth D = sum_j w_j d_j, near the
-greatest depth for any number of points. The body gets the momentum
+At the predicted pose, surface point j of a body is inside the other solid at a depth d_j > 0. The face above the point
+has the normal n_j, and d_j is measured along this normal. Points have the weights w_j = d_j^3 / sum d_j^3. The depth of
+the contact is D = sum_j w_j d_j, which is near the greatest depth for any number of points. The body gets the momentum
 
     P = (q / dt) m D sum_j w_j n_j,   1 / m = 1 / M + r^2 / I,
 
-and the other solid -P. Here r is the arm of P and I the least moment of inertia; if the other solid is free, 1 / m also
-has the same terms of that body. Each contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies have
-points in each other, and both contacts have the weight one half.
+and the other solid gets -P. The formula has the stiffness q, the time step dt, the mass M of the body, the arm r of P,
+and the least moment of inertia I. If the other solid is free, its terms 1 / M and r^2 / I are added to 1 / m. A contact
+oscillates with the angular frequency sqrt(q) / dt. Two free bodies have two contacts, because surface points of each
+body are inside the other body. The two contacts have the weight one half.
 
-*Restitution*: beta - 1 times the growth of D in the step is added to D. beta(e), with which a body rebounds at e times
-its speed, is fitted to steps of a body that hits a wall: within 0.004 for e from 0.03 to 0.95; for e = 1 it rebounds at
-0.98.
+*Restitution*: The product of beta - 1 and the growth of D in the step is added to D. The factor beta is a function of
+the coefficient of restitution e. The function is fitted to simulated impacts on a wall, so that a body rebounds at e
+times its speed. For e from 0.03 to 0.95, the error of the fit is at most 0.004. For e = 1 a body rebounds at 0.98 times
+its speed.
 
-*Friction* (Coulomb's): the momentum that would stop all slip is Q = sum_j w_j (m_j u_j + M g dt). Point j slips with
-the velocity u_j and m_j is its effective mass. The term M g dt, gravity along the face, is zero if the other solid is
-free. The body gets
+*Friction* (Coulomb): The momentum Q = sum_j w_j (m_j u_j + M g dt) would stop all slip. Point j slips with the velocity
+u_j, and m_j is its effective mass. The term M g dt contains gravity g along the face. If the other solid is free, the
+term is zero. With the coefficient of friction mu, the body gets the momentum
 
-    -Q / (1 + t^8)^(1/8),   t = sum_j w_j |m_j u_j + M g dt| / (mu (q / dt) m D):
+    -Q / (1 + t^8)^(1/8),   t = sum_j w_j |m_j u_j + M g dt| / (mu (q / dt) m D).
 
-which stops the slip if Q is small, and is mu times the push if Q is large. A body at rest on a slope creeps with up to
-t^8 / 8 times M g dt / m_j.
+If Q is small, this momentum stops the slip. If Q is large, the magnitude is mu times the normal momentum. A body at
+rest on a slope creeps at a speed of up to t^8 / 8 times M g dt / m_j.
 
-Derivatives jump when a contact begins or the face above a point changes; at mu = 0 the derivative with respect to mu is
+Derivatives jump when a contact begins or the face above a point changes. At mu = 0 the derivative with respect to mu is
 one-sided.
 """
 
@@ -55,7 +57,7 @@ STIFFNESS = 0.04
 FAR = 1e6
 """Greatest distance of the search for faces [m]."""
 SHARES = ("pushes", "drags", "scales")
-"""Names of arrays with terms of surface points: normal momentum, friction momentum and weights."""
+"""Names of arrays over surface points: the normal momentum, the friction momentum and the weight of each point."""
 OWN = ("before", "turned_before", "after", "turned")
 POSES = ("before", "turns_before", "after", "turns")
 NUMBERS = ("time_step", "density", "other_density")
@@ -65,8 +67,8 @@ NUMBERS = ("time_step", "density", "other_density")
 def contact_kernels(precision: Precision) -> SimpleNamespace:
     """Make the kernels of contacts.
 
-    ``look`` finds the depth of each surface point. ``push`` computes the points' terms of momenta. ``give`` adds the
-    sums of the terms to the momenta of both solids.
+    ``look`` finds the depth of each surface point. ``push`` computes the momenta that each point contributes. ``give``
+    adds the sums over all points to the momenta of both solids.
     """
     real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
     modules, stiffness = [free_module(precision, "contacts")] * 3, wp.constant(real(STIFFNESS))
@@ -210,7 +212,7 @@ Arrays = dict[str, wp.array]
 
 @dataclass(frozen=True)
 class Touching:
-    """A free body and solids that it may touch: all solids at rest, or one moving solid."""
+    """Solids that a free body may touch: either all solids at rest, or one moving solid."""
 
     body: int
     """Index of the body among the free bodies."""
@@ -252,7 +254,7 @@ class Contact:
 
 
 class Totals:
-    """Terms of the surface points of a body, and the sums of the terms over each scene."""
+    """Contributions of a body's surface points, and the sums of the contributions for each scene."""
 
     def __init__(self, contact: Contact, kinds: Mapping[str, Any], suffix: str = "", end: str = "_sum"):
         size = contact.count, contact.layout.device, contact.layout.members
@@ -278,7 +280,6 @@ class Contacts:
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
         of_solids = part.made_of.walls.each
         self._poses: list[Named] = []
-        """Pose, scale and tangents of each touched solid by names of kernel arguments."""
         for against in (contact.touching.against for contact in self.contacts):
             other = resting_pose(layout) if against < 0 else of_solids[against]
             self._poses.append({f"other_{name}": array for name, array in other.items()})

@@ -22,7 +22,7 @@ from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
-"""Index for "no particle is lost"."""
+"""Index that stands for no lost particle."""
 
 
 @cache
@@ -95,7 +95,7 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
-        """Test if the point ``y`` is deeper in solid ``k`` than its tolerance."""
+        """Test if the depth of the point ``y`` in solid ``k`` exceeds the solid's tolerance."""
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
         depth = real(0.0)
@@ -142,9 +142,9 @@ def lost_kernel(precision: Precision) -> Any:
     ):  # fmt: skip
         """Write the first lost particle of each scene to ``bad``, and the number of lost particles to ``count``.
 
-        A particle is lost if it is not finite, too far away, without volume, or went through a wall. Fluid may flow
-        over the rim of an open container. Particles from ``first_waiting`` on may pass through walls when an emitter or
-        a drain moves them.
+        A particle is lost if its position is not finite or too far away, if it has no volume, or if it went through a
+        wall. Fluid may flow over the rim of an open container. Particles with indices from ``first_waiting`` may pass
+        through walls when an emitter or a drain moves them.
         """
         i = wp.tid()
         member = i // particles
@@ -184,7 +184,7 @@ Distance = Callable[[Points], Points]
 
 @dataclass(frozen=True)
 class Lost:
-    """The first lost particles of a scene, all in the same step."""
+    """The particles of a scene that were lost in the first step with a loss."""
 
     step: int
     particle: int
@@ -195,7 +195,8 @@ class Containment:
     def __init__(
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
-        """Prepare the search. Particles from ``first_waiting`` on may be moved by an emitter or a drain."""
+        """Prepare the search for lost particles. An emitter or a drain may move particles with indices from
+        ``first_waiting``."""
         precision, members, device = layout.precision, layout.members, layout.device
         self.walled, self._precision, self._launch = walled, precision, launch
         self._kernel, vector, obstacles = lost_kernel(precision), precision.vector_of, (*walled.solids, *walled.moving)
@@ -238,9 +239,11 @@ class Containment:
                 array.fill_(well)
 
     def look(self, known: Named, state: State) -> None:
-        """Find lost particles at the end of a step. ``known`` has ``order``, ``x_before`` and ``rho_0`` from before the
-        step, and the new positions ``x_free`` and velocities ``v_free`` without emitters and drains. ``state`` is the
-        new state."""
+        """Find lost particles at the end of a step. ``state`` is the new state.
+
+        ``known`` contains ``order``, ``x_before`` and ``rho_0`` from before the step. The new positions ``x_free`` and
+        velocities ``v_free`` in ``known`` are without the effects of emitters and drains.
+        """
         found = {"bad_step": self.bad_step, "bad": self.bad_particle, "count": self._count}
         self._launch(self._kernel, self._constants, known, found, x=state.positions)
 
@@ -296,13 +299,14 @@ def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: 
 NARROW = 0.95
 """Smallest gap between two walls that does not squeeze particles [spacings]."""
 FACING = -0.5
-"""Greatest scalar product of the normals of two facing walls."""
+"""Two walls face each other if the scalar product of their normals is less than this number."""
 STEP = 1e-3
 """Step of finite differences for normals [spacings]."""
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Return the names of walls with too narrow a gap at the points (n, d) [m] after the last step, or None."""
+    """Return a sentence about two walls with too narrow a gap at the points (n, d) [m], or None. Walls are at their
+    positions after the last step."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [(name, one, d) for name, one in containment.walls(member) if ((d := one(points)) < best).any()]

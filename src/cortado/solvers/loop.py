@@ -20,7 +20,7 @@ from cortado.solvers.containment import NO_PARTICLE, Containment
 from cortado.solvers.solver import Counts
 
 UNKNOWN = 2**31 - 1
-"""Number of iterations of a loop that has not ended."""
+"""Value of the number of iterations while a loop has not ended."""
 
 
 @cache
@@ -97,7 +97,8 @@ def convergence_kernels(precision: Precision, weighted: bool = False) -> SimpleN
 
 
 class IterativeSolve(Protocol):
-    """Protocol of an iterative solve for a force. The force has it as the attribute ``solve``."""
+    """Protocol of an iterative solver that belongs to a force. The attribute ``solve`` of the force is the iterative
+    solver."""
 
     name: str
     """Name of the iterations in the diagnostics of a run."""
@@ -116,20 +117,21 @@ class LoopLimits:
 
 
 class StepRecord:
-    """Numbers of a loop or of a force's solve for each step."""
+    """Numbers of iterations and errors in each step, for a loop or for the iterative solver of a force."""
 
     def __init__(self, steps: int, layout: Layout, name: str, columns: Sequence[str] = ()):
-        """Allocate room for ``steps`` steps. ``name`` and ``columns`` are names of iterations and errors in
-        diagnostics."""
+        """Allocate arrays for ``steps`` steps. In diagnostics, ``name`` is the name of the iterations, and ``columns``
+        are the names of the errors."""
         shape, kinds = (max(steps, 1), layout.members), (wp.int32, layout.precision.pair)
         self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in kinds[: 2 if columns else 1]]
-        """Iterations, and with ``columns`` errors, on the device (steps, members)."""
+        """Numbers of iterations and errors on the device (steps, members). The errors exist only with ``columns``."""
         self.copies, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
         self._name, self._columns = name, columns
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Take the first ``steps`` steps as the last run. Their numbers are read from the device when needed."""
+        """Regard the first ``steps`` recorded steps as the last run. Recorded values are copied from the device when
+        needed."""
         self._steps = steps
         self._diagnostics: dict[str, NDArray] | None = None
 
@@ -145,11 +147,13 @@ class StepRecord:
 
     @property
     def counts(self) -> NDArray:
-        """Return the number of iterations of each step (steps,). In a batch it is the greatest number of all scenes."""
+        """Return the number of iterations of each step (steps,). In a batch, return the greatest number over all
+        scenes."""
         return self.copies[0].read(self._steps).max(axis=1)
 
     def is_within(self, limits: Mapping[str, float]) -> bool:
-        """Test if no diagnostics of the last run exceed their ``limits`` by name, and none of these are NaN."""
+        """Test if the diagnostics named in ``limits`` do not exceed their limits in the last run. A diagnostic that is
+        NaN fails the test."""
         columns = {
             name: self.copies[1].read(self._steps)[..., k] for k, name in enumerate(self._columns) if name in limits
         }
@@ -165,7 +169,7 @@ class StepRecord:
 
 
 class IterationLog:
-    """A `StepLog` of loops and of the solves of forces."""
+    """A `StepLog` of the iterations in loops and in forces."""
 
     def __init__(self, steps: int, loops: Sequence["Loop"], solves: Sequence[IterativeSolve], layout: Layout):
         self.loops = [(loop, StepRecord(steps, layout, loop.iterations_name, loop.columns)) for loop in loops]
@@ -205,7 +209,7 @@ class IterationLog:
 
 
 class Loop:
-    """A loop of iterations over all particles. It ends on the device when the errors are small enough."""
+    """A loop of iterations over all particles. The loop ends on the device when the errors are small enough."""
 
     def __init__(
         self,
@@ -216,17 +220,21 @@ class Loop:
         errors_name: str = "density_errors",
         weighted: bool = False,
     ):
-        """Prepare a loop. With ``limits`` None it has no iterations. The names appear in diagnostics. The errors of all
-        particles are reduced to a weighted root mean square, or to average and maximum."""
+        """Prepare a loop. With ``limits`` None the loop has no iterations. The iterations and errors have the given
+        names in diagnostics.
+
+        If ``weighted`` is true, the errors of all particles are reduced to a weighted root mean square. Otherwise the
+        errors are reduced to average and maximum.
+        """
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [errors_name] if weighted else [errors_name, f"greatest_{errors_name}"]
         """Names of the reduced errors in diagnostics."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
-        """Errors of each particle in the last iteration, as pairs of numbers (n,)."""
+        """Two error values of each particle in the last iteration (n,)."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
-        """Number of iterations of each scene (members,), or `UNKNOWN` while the loop runs. Scenes that have ended must
-        not change in later iterations."""
+        """Number of iterations of each scene (members,), or `UNKNOWN` while the loop runs. Later iterations must not
+        change a scene that has ended."""
         self._launch, self._kernels = launch, convergence_kernels(precision, weighted)
         size = layout.particles, precision, device, layout.members
         self._sum = layout.sum_of(precision.pair) if weighted else sum_and_maximum(*size)
@@ -235,7 +243,8 @@ class Loop:
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
         """Fixed number of iterations, or 0."""
         self.bounds: dict[str, float] = {}
-        """Bounds on the reduced errors of a step that has converged, by name. A fixed number of iterations has none."""
+        """Bounds on the reduced errors of a step that has converged, by name. With a fixed number of iterations the
+        dict is empty."""
         if limits is not None and not is_fixed:
             self.bounds = dict(zip(self.columns, (limits.tolerance, limits.greatest_tolerance), strict=False))
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
@@ -256,7 +265,8 @@ class Loop:
 
     def run(self, iterate: Callable[[int], None]) -> None:
         """Iterate until the errors are small enough. ``iterate`` is called with the number of the iteration, from 0.
-        After the minimum number of iterations, a CUDA graph repeats one call, with the maximum number as its argument.
+
+        After the minimum number of iterations, a CUDA graph repeats the call ``iterate(maximum_iterations)``.
         """
         limits = self.limits
         if limits is None:

@@ -1,4 +1,4 @@
-"""The container and the solids of a scene as meshes, and emitters and drains, in the form that a solver uses."""
+"""Geometry of a scene for solvers: the container and the solids as meshes, and emitters and drains."""
 
 import itertools
 from collections.abc import Iterator
@@ -56,12 +56,13 @@ class Walled:
     """The region for particles: the container and the solids."""
 
     region: Region
-    """Region inside the container, unbounded along periodic axes. Without pressure the region is the whole space."""
+    """Region inside the container, unbounded along periodic axes. For a solver without pressure the region is the whole
+    space."""
     near: Region
     spacing: float
     solids: tuple[Obstacle, ...]
     moving: tuple[Obstacle, ...]
-    """Moving solids, in frames with the solid's middle as origin."""
+    """Moving solids. The origin of each solid's frame is the middle of the solid."""
     periods: Points
     """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
 
@@ -74,7 +75,8 @@ class Walled:
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """Return the largest allowed box of positions, which the precision of positions may limit."""
+        """Return the largest allowed box of particle positions. The floating-point precision may limit the size of the
+        box."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
@@ -144,8 +146,8 @@ class FlatFaces:
 def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
     """Return up to ``most`` faces of moving solids that mirror the fluid. ``support`` is the support radius [m].
 
-    Only scenes with the projection and without periodic axes have mirroring faces. They are long edges of 2-D boxes and
-    polygons, and sides of 3-D boxes, of solids with a prescribed path and free slip.
+    Only scenes with the projection and without periodic axes have mirroring faces. Mirroring faces are long edges of
+    2-D boxes and polygons, and sides of 3-D boxes. Solids with mirroring faces have a prescribed path and free slip.
     """
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):

@@ -64,7 +64,7 @@ class ParticleTangent:
 
 
 class ParticleAdjoint:
-    """The adjoint of a step. It applies the adjoints of the step's parts in reverse order."""
+    """The adjoint of a step. The adjoints of the step's parts are applied in reverse order."""
 
     def __init__(self, solver: ParticleSolver, steps: int):
         layout = solver.layout
@@ -109,7 +109,8 @@ class ParticleAdjoint:
         context.launch(self._solver.integration.begin_adjoint, *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
-        """Apply the adjoint of the velocity prediction and of the forces. Add the adjoints ``within`` the step."""
+        """Apply the adjoint of the velocity prediction and of the forces. ``within`` contains adjoints of intermediate
+        quantities of the step, which are added."""
         fields = self.bar.fields
         if within is not None:
             add(within.v_star, fields["v"])

@@ -57,7 +57,7 @@ class ParticleSolver(Staying):
     """The base class of particle solvers. Every step reuses the same arrays.
 
     `Solver` documents the methods. A subclass defines `step`, `replay` and `write_state`. A subclass with loops also
-    defines `reserve`, and a subclass with derivatives `tangent`, `adjoint` and `differentiable`.
+    defines `reserve`. A subclass with derivatives also defines `tangent`, `adjoint` and `differentiable`.
     """
 
     carried_fields: tuple[StateField, ...] = ()
@@ -65,7 +65,7 @@ class ParticleSolver(Staying):
     topic = "density"
     """Part of the names of Warp modules."""
     density_power = 2
-    """Exponent of the number density, by which the pressure force divides the pressure."""
+    """The pressure force divides the pressure by this power of the number density."""
     shares: tuple[str, ...] = ()
     """Parameters of the solver with adjoints that are sums over particles."""
 
@@ -95,7 +95,7 @@ class ParticleSolver(Staying):
         if layout.phases == 1:
             self.fractions.fill_(1.0)
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
-        """Partial sums of accelerations: entry t is the sum over the first t forces."""
+        """Partial sums of accelerations. The array with index t is the sum over the first t forces."""
         self.loops: tuple[Loop, ...] = ()
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
@@ -108,7 +108,7 @@ class ParticleSolver(Staying):
         return Density(self.discretisation, self.topic)
 
     def wall_push(self) -> WallAction:
-        """Return the sums over walls from which the pressure force on walls is computed."""
+        """Return the sums over walls that determine the pressure force on walls."""
         return WallSums(wall_slope_term(self.discretisation), self.layout)
 
     def image_loads(self) -> Any:
@@ -249,8 +249,8 @@ class ParticleSolver(Staying):
             self.launch(kernels.count_step, bad, step=self.step_number, **each)
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """Return the densities (n,) [kg / m3] of a state in scene order. A batch returns the scenes one after the
-        other.
+        """Return the densities (n,) [kg / m3] of a state in scene order. For a batch, the array contains one scene
+        after the other.
 
         Moving solids are at their poses at the end of step ``step``. The call overwrites the arrays of the solver.
         """
@@ -263,7 +263,8 @@ class ParticleSolver(Staying):
         return found
 
     def pressures(self) -> wp.array | None:
-        """Return the pressures (n,) [Pa] of sorted particles on walls in the last step, or None without pressure."""
+        """Return the pressure (n,) [Pa] on walls of each sorted particle in the last step. Return None for a solver
+        without pressure."""
         return None
 
     def stresses(self) -> wp.array | None:

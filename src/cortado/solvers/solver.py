@@ -18,7 +18,7 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
 
 Counts = tuple[int, ...]
-"""Numbers of iterations of each loop in a step. A step with given numbers can be repeated exactly."""
+"""Numbers of iterations of each loop in a step. With these numbers, the step can be repeated exactly."""
 
 
 class StepLog(Protocol):
@@ -42,7 +42,8 @@ class StepLog(Protocol):
         """Test if all loops converged in all steps up to the last `read`, without diagnostics above ``limits``."""
 
     def read(self, steps: int) -> None:
-        """Take the first ``steps`` steps as the last run. Their diagnostics are read from the device when needed."""
+        """Set the number of steps of the last run to ``steps``. The diagnostics of these steps are read from the device
+        when needed."""
 
     def assign(self, other: Self) -> None:
         """Copy the diagnostics from a log of the same solver and length."""

@@ -1,8 +1,8 @@
 """Surface tension by curvature, as a force across the surface (continuum surface force, Brackbill et al. 1992). Normals
 are smoothed, and the curvature is corrected (Morris 2000; Zorilla et al. 2020).
 
-With g_ij = V grad W_ij, sums over the fluid and the particle itself, the spacing s, and a smoothstep S(a, b) from a to
-b:
+Let g_ij = V grad W_ij, with the volume V of a particle. S(a, b) is a smoothstep from a to b, and s the spacing. With
+sums over the fluid, including the particle itself, the force follows from
 
     g_i = sum_j g_ij,   z_i = V sum_j W_ij,   q_i = V sum_j W_ij g_j / z_i,
     w_i = S(0.03, 0.1) of s |q_i|,   e_i = q_i / |q_i|,
@@ -10,20 +10,21 @@ b:
     a_i = V sum_j W_ij w_j kappa_j,   b_i = V sum_j W_ij w_j,
     k_i = (a_i / b_i) / (1 + delta a_i / b_i),   m_i times the acceleration = (sigma / J) k_i w_i q_i.
 
-g is the gradient of the fluid's colour, and its average q (Shepard 1968) points into the fluid. The weight w is 1 at
-the surface and 0 inside; e is the normal. D B^-1 is the gradient of normals, exact where they are linear (Bonet and Lok
-1999). The force acts at a mean depth delta below the surface, where the curvature 1 / R of the surface becomes 1 / (R -
-delta). J is the sum of w |q| over the layers of a flat surface, the mean of two cut lattices. The trace needs only the
-symmetric part of D.
+The vector g is the gradient of the fluid's colour, and its average q (Shepard 1968) points into the fluid. The weight w
+is 1 at the surface and 0 inside; e is the normal. D B^-1 is the gradient of normals, and is exact if normals vary
+linearly (Bonet and Lok 1999). The trace kappa needs only the symmetric part of D. The force acts at a mean depth delta
+below the surface, where the curvature 1 / R of the surface becomes 1 / (R - delta). J is the sum of w |q| over the
+layers of a flat surface, averaged over an axis-parallel and a diagonal cut of the lattice.
 
-The constants in delta, in spacings, were fitted to discs and balls of concentric rings and shells. They hold within
-0.05 for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth `DEEP`, and
-the sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop would be (d - 1)
-sigma / R.
+The constants in delta, in spacings, were fitted to discs and balls of concentric rings and shells. The fitted values
+hold within 0.05 for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth
+`DEEP`, and the sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop would
+be (d - 1) sigma / R.
 
-A wave of the surface moves less at the depth `ACTS` where the force acts. The squared frequency of mode n would be too
-small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. Subtracting ACTS d / (3 (d - 1)) from delta makes the errors of
-pressure and of the squared frequency of mode 2 equal and opposite: 0.5 / R in 2-D and 0.75 / R in 3-D.
+A surface wave has a smaller amplitude at the depth `ACTS`, where the force acts. The squared frequency of mode n would
+therefore be too small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. Subtracting ACTS d / (3 (d - 1)) from delta
+makes the errors of pressure and of the squared frequency of mode 2 equal and opposite: 0.5 / R in 2-D and 0.75 / R in
+3-D.
 """
 
 from dataclasses import dataclass
@@ -85,7 +86,7 @@ SINGULAR = {2: 1e-3, 3: 1e-4}
 LONE = 1e-6
 """Regularisation of the sum of weights. The mean curvature is then 0 without neighbours in the surface."""
 HOLLOW = 0.25
-"""Greatest curvature of a bubble, times the depth of the force, without smooth limitation."""
+"""Curvature of a bubble times the depth of the force. Above this value the curvature is smoothly limited."""
 
 
 @cache
@@ -133,8 +134,8 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
 @cache
 def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of the sums over the fluid, with derivatives. Symmetric matrices are stored as the
-    diagonal and the entries yz, xz and xy."""
+    """Make the Warp functions of the sums over the fluid, with derivatives. A symmetric matrix is stored as its
+    diagonal and its components yz, xz and xy."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), precision.matrix

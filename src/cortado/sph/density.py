@@ -156,11 +156,12 @@ def _work(d: Discretisation) -> Any:
 
 
 class WallAction(Protocol):
-    """Protocol of the action of walls on particles by one force, which is read after a step. ``solid`` is the number of
-    a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """Protocol of the action of walls on particles by one force. The action is read after a step. ``solid`` is the
+    number of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return the action of walls on sorted particles, (n,) vectors. For a force, it is accelerations [m / s2]."""
+        """Return the action of walls on sorted particles, (n,) vectors. The action of a force consists of accelerations
+        [m / s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
         """Return the tangents of the action (n,). Forward mode of the step must be complete."""

@@ -1,16 +1,18 @@
 """Drains, which remove particles that enter them, and sinks, to which fluid flows at a given flow rate.
 
-A particle inside a drain at the start of a step is removed. From the end of the step on it rests far from all others,
-and its field ``drained`` is the number of the drain. The removal has no derivative.
+A particle inside a drain at the start of a step is removed. At the end of the step, a removed particle is put at a
+resting position far from all others. The particle's field ``drained`` is then the number of the drain. The removal has
+no derivative.
 
-A sink makes fluid flow to its middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions:
+A sink makes fluid flow to its middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions. The velocity after
+explicit forces, with the acceleration a, is
 
     v* = (1 - phi) (v + dt a) + phi (u - lambda w),   u = -Q y / (S r^d),
 
-instead of v + dt a. S is the part of the unit sphere or circle that walls leave open. phi rises smoothly from 0 at r_2
-to 1 at r_1. Particles within r_0 < r_1 are removed, so that a removed particle has neighbours with prescribed motion.
-The velocity change w by pressure in the previous step is damped by lambda < 1. Without w, pressure would press fluid
-through the shell from r_0 to r_1.
+instead of v + dt a. S is the part of the unit sphere or circle that walls leave open. The weight phi of the prescribed
+flow u rises smoothly from 0 at the radius r_2 to 1 at the radius r_1. Particles within r_0 < r_1 are removed, so that a
+removed particle has neighbours with prescribed motion. The term with lambda < 1 damps w, the velocity change by
+pressure in the previous step. Without this term, pressure would press fluid through the shell from r_0 to r_1.
 
 Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. M is the number of particles within
 r_1. E is the rounded number of particles that the sink should have removed but has not, from -M / 4 to M / 4. E has no
@@ -57,7 +59,7 @@ class Mouth:
     shape: int
     middle: Points
     ends: Points
-    """Corners of a box relative to its middle (2, d) [m], or twice the direction of a plane."""
+    """Corners of a box relative to its middle (2, d) [m]. For a plane, both rows are its direction."""
     radius: float = 0.0
 
 
@@ -163,7 +165,7 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
 
 @cache
 def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, Kernels]:
-    """Make the kernels of sinks, for counts of removed and of missing particles, the acceleration and the flow rate."""
+    """Make the kernels of sinks: counts of removed and of missing particles, the acceleration, and the flow rate."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
     modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
@@ -285,7 +287,6 @@ class Drains(Part):
         return self.layout.sum_of(self.layout.precision.real)
 
     def _mouth(self, one: Mouth, number: int, box: Named) -> tuple[Any, Any]:
-        """Return the struct of a drain, and its middle or the name of the parameter of its middle."""
         layout, found = self.layout, mouth_type(self.layout.precision)()
         found.shape, found.number, found.radius = one.shape, float(number + 1), one.radius
         found.lower, found.upper = map(layout.precision.vector_of, one.ends)

@@ -1,16 +1,18 @@
 """Fluid from a nozzle: the motion of particles is prescribed until they pass the opening of the nozzle.
 
-A particle starts at the distance u upstream of the opening, with the offset o from the axis. It is prescribed in steps
-n = 0, 1, ... while s = u - l > 0, where l grows by w dt in each step, with the speed w = Q / A:
+A particle starts at the distance u upstream of the opening, with the offset o from the axis. The column moves with the
+speed w = Q / A, the flow rate Q divided by the area A of the opening. In each step its emitted length l grows by w dt.
+While s = u - l is positive, the particle's motion is prescribed in steps n = 0, 1, ...:
 
     x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
 
-q_n is the position of the opening after step n (at rest before the first), and e its direction. Q is the flow rate in
-the step, and A the area of the opening. Position and velocity do not jump when a particle becomes free. Particles
-further upstream than the column is long are in reserve: they rest at separate places, without derivative.
+q_n is the position of the opening after step n (at rest before the first), and e the direction of the flow. Position
+and velocity do not jump when a particle becomes free. Particles further upstream than the length of the column are in
+reserve: they rest at separate places, without derivative.
 
-A nozzle fed by drains emits removed particles again. When the column has room for a layer at its end, available
-particles join it, in line behind the first particles. The choice has no derivative.
+A nozzle fed by drains emits removed particles again. When the column has room for another layer at its upstream end,
+removed particles form this layer, with the same offsets as the first particles. The choice of particles has no
+derivative.
 """
 
 from dataclasses import dataclass

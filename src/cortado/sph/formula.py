@@ -1,8 +1,8 @@
 """User-defined Python functions in kernels, compiled by Warp in float32 or float64, with derivatives.
 
-Numbers, vectors and times among the parameters of a function are stored in one vector. Arrays, such as the weights of a
-neural network, are stored in one table (members, numbers). The adjoint of the table needs no atomic operations: each
-thread adds to a separate row, and the rows are summed in a fixed order.
+Numbers, vectors and times among the parameters of a function are stored in one vector. Array parameters, such as the
+weights of a neural network, are stored together in one array (members, numbers). The adjoint of this array needs no
+atomic operations: each thread adds to a separate row, and the rows are summed in a fixed order.
 """
 
 import ast
@@ -45,7 +45,7 @@ def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
 
 @cache
 def table_type(precision: Precision) -> Any:
-    """Return the Warp struct of a force's arrays: values, tangents and rows of the adjoint."""
+    """Return the Warp struct of a force's array parameters: values, tangents, and an adjoint for each thread."""
     return struct_of("Table", precision, **dict.fromkeys(("values", "dots", "rows"), wp.array2d(dtype=precision.real)))
 
 
@@ -90,8 +90,8 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the kernels that copy a parameter's values in a step to a table, and that add the adjoint of the table to
-    the adjoint of the parameter."""
+    """Make two kernels. One copies a parameter's values in a step to the common array of parameters. The other adds the
+    adjoint of the common array to the adjoint of the parameter."""
     typed = TypesByName(wp.array2d(dtype=precision.real), {wp.int32: "step"})
 
     @wp.kernel(module=arrays_module(precision, True, taped))
@@ -112,7 +112,7 @@ def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 
 class Numbers:
-    """The numbers of several parameters, stored in one table (members, numbers)."""
+    """The values of several parameters, stored in one array (members, numbers)."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._kernels = packing_kernels(layout.precision, taped) if parameters else None
@@ -122,7 +122,8 @@ class Numbers:
         self.size = sum(sizes)
 
     def launch(self, kernel: str, step: StepContext, values: Parameters, table: wp.array) -> None:
-        """``pack`` the values of a step in the table, or ``add`` the adjoint of the table to the values."""
+        """Launch a kernel. ``pack`` copies the values of a step to the array ``table``. ``add`` adds the adjoint of
+        ``table`` to the adjoints of the values."""
         for name, first, size in self._places:
             count = values[name].size * getattr(values[name].dtype, "_length_", 1)
             numbers = components(values[name], (self._members, count // self._members))
@@ -142,7 +143,7 @@ class OwnParameters:
         options: dict[str, Any] = {"dtype": dtype, "device": layout.device}
         self._theta, self._theta_dot = wp.zeros(members, **options, requires_grad=taped), wp.zeros(members, **options)
         self._theta_bar = wp.zeros(layout.all_particles, **options)
-        """Terms of particles in the adjoint of the parameter vector (n,)."""
+        """Terms of particles (n,) in the adjoint of the vector of parameters."""
         self._sum_theta = layout.sum_of(dtype) if own else None
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (members * max(self._size, 1))), 1)

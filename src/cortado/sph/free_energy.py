@@ -1,5 +1,5 @@
-"""Helmholtz free energies F(c) = alpha f(c) of a mixture with mass fractions c, and mobilities of its phases (Yang et
-al. 2015).
+"""Helmholtz free energies F(c) = alpha f(c) of a mixture with mass fractions c, and mobilities m(c) of its phases (Yang
+et al. 2015).
 
     double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015)
     miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
@@ -15,8 +15,10 @@ The phases diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
     c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
     B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x^T G / (|x|^2 + 0.01 h^2)
 
-chi is the chemical potential. The terms of B are antisymmetric in i and j, so that the mass sum_i m_i c_k,i of each
-phase is constant to round-off. P keeps sum_k c_k constant. The discrete free energy
+Here chi is the chemical potential, eps the interface width, M_0 the mobility of the scene, and n the number density.
+The mass of particle i divided by its volume V is m_i, and G is the kernel gradient. The terms of B are antisymmetric in
+i and j, so that the mass sum_i m_i c_k,i of each phase is constant to round-off. P keeps sum_k c_k constant. The
+discrete free energy
 
     E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
 
@@ -52,14 +54,15 @@ FLOOR = 1e-3
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define more."""
+    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define other free
+    energies."""
 
     name: str
     value: Callable[[np.ndarray], np.ndarray]
     """Function from mass fractions (n, phases) to free energies (n,)."""
     curvature: float
-    """Greatest eigenvalue of the Hessian of the free energy, for mass fractions from 0 to 1 with a constant sum. It
-    bounds the time step."""
+    """Greatest eigenvalue of the Hessian of the free energy, for mass fractions from 0 to 1 with a constant sum. The
+    eigenvalue bounds the time step."""
     functions: Callable[[Precision, int], Any]
     """Function from a precision and a number of phases to an object with two Warp functions. ``gradient`` is the
     gradient of the free energy, and ``hessian_product`` the product of its Hessian and a vector."""
@@ -248,8 +251,8 @@ MOST_SUBSTEPS = 10_000
 def stable_substeps(
     scene: Scene, energy: FreeEnergy, time_step: float, mobility: float, width: float, densities: np.ndarray
 ) -> int:
-    """Return the number of stable diffusion substeps in a time step [s]. ``mobility`` is in m2/s, ``interface_width``
-    in m, and ``rest_density`` (phases,) in kg/m3. The length of a substep is at most
+    """Return the number of diffusion substeps that makes a ``time_step`` [s] stable. ``mobility`` is in m2/s, the
+    interface ``width`` in m, and the rest ``densities`` (phases,) in kg/m3. The length of a substep is at most
 
         dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 

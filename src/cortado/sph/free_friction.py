@@ -1,14 +1,14 @@
 """Free bodies without slip in the implicit viscous solve, with derivatives; see `cortado.sph.friction_kernels`.
 
 The velocities of bodies are additional unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). M is the mass
-matrix of a body, F(u, U) the force on the body, and U its velocities at the start of the step with gravity and contact.
-Then
+matrix of a body, and F(u, U) the force of fluid with velocities u on the body. U are the body's velocities at the start
+of the step, with gravity and contact. The solve has the additional equations
 
     U' = U + M^-1 J,   J = dt F(u', U'),
 
-are additional equations of the operator B (`cortado.sph.viscous_stress`), which is symmetric in the product weighted
-with the masses of particles and M. J is added to the momenta by contact before pressures act, so that light bodies
-neither oscillate nor need smaller steps.
+where u' and U' are the velocities at the end of the step. The operator B of `cortado.sph.viscous_stress` remains
+symmetric, in the product weighted with the masses of particles and M. The impulse J is added to the momenta by contact
+before pressures act, so that light bodies neither oscillate nor need smaller steps.
 
 Friction resists velocities before pressures act, but pressures hold fluid and bodies against gravity. Therefore u
 excludes gravity, and U includes the change by the pressures of the previous step.
@@ -133,8 +133,8 @@ class FreeFriction:
         step.launch(kernel, *groups, begun(body), *body.known(step), threads=self.layout.members)
 
     def pull(self, step: StepContext, *known: Named, v: wp.array, solves: bool = False) -> None:
-        """Add the terms of rigid bodies to the velocity sums and stresses of particles with velocities ``v``. In a
-        solve the bodies have the velocities of its vector."""
+        """Add the terms of rigid bodies to the velocity sums and stresses of particles with velocities ``v``. With
+        ``solves``, the velocities of bodies are from the vector of the solve."""
         for _, own, rows in self.each(step):
             step.launch(self.kernels.pull, rows.velocities if solves else {}, own.arrays, self.constants, *known, v=v)
 
@@ -159,7 +159,8 @@ class FreeFriction:
         self.start(step)
 
     def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
-        """Add the action of rigid bodies to ``total``, that of one or all solids. ``name`` is "rub" or "couple"."""
+        """Add the action of rigid bodies to ``total``, the action of one or all solids. ``name`` is "rub" or
+        "couple"."""
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
                 step.launch(self.kernels.rub.forward, own.arrays, self.constants, now)
@@ -318,7 +319,8 @@ class FrictionAdjoint(FrictionChanges):
             self._shared(step, kernels.lean.adjoint, change.before, change.body.before, *groups)
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
-        """Apply the adjoints of the bodies' final velocities. ``u_bar`` is that of the particles' final velocities."""
+        """Apply the adjoints of the bodies' final velocities. ``u_bar`` is the adjoint of the particles' final
+        velocities."""
         of = self._friction
         if of.rows:
             share, sizes = self._shares["V_bar"], {"time_step_bar": bar.parameters["time_step"]}

@@ -166,7 +166,7 @@ class Push(Protocol):
     """Protocol of forces on free bodies in addition to fluid and gravity, such as contacts and springs."""
 
     def look(self, step: StepContext) -> None:
-        """Add to the momenta of rigid bodies, `FreeBody.given`."""
+        """Add the momenta by this force to `FreeBody.given` of the rigid bodies."""
 
     def tangent(self, changes: "Sequence[Changes]") -> Any:
         """Return the tangent. Its method ``look(step, dot)`` adds to `Changes.given`."""

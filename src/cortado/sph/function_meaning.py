@@ -73,7 +73,7 @@ class InPrecision(ast.NodeTransformer):
         self._what, self._scope, self._local = what, scope, local
         sizes = [prod(shape) for shape in shapes.values()]
         self._arrays = {name: (sum(sizes[:k]), shape) for k, (name, shape) in enumerate(shapes.items())}
-        """Start index and shape of each array in the table of all arrays, by name."""
+        """Start index and shape of each array parameter in the array of all parameters, by name."""
         self._counts: dict[str, int] = {}
         self._given = set[str]()
 
@@ -228,8 +228,8 @@ def text_for_warp(
 ) -> str:
     """Return the source code of a user-defined function for Warp. ``shapes`` are the shapes of arrays by name.
 
-    Raise `InputError` for code that Warp lacks, cannot differentiate or understands differently from Python. Also raise
-    `InputError` if the function may not return a ``kind``.
+    Raise `InputError` for code that Warp does not support, cannot differentiate, or interprets differently from Python.
+    Also raise `InputError` if the function may not return a ``kind``.
     """
     for helper in frozen.helpers:
         tree = helper.adj.tree

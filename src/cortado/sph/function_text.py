@@ -116,7 +116,7 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 class Frozen:
     """Copies of all outside values that a function and the functions it calls read.
 
-    They are numbers, vectors, attributes of modules and objects, and ``@wp.func`` functions.
+    The values are numbers, vectors, attributes of modules and objects, and ``@wp.func`` functions.
     """
 
     def __init__(self, what: str, function: FunctionType):
@@ -172,7 +172,8 @@ class Frozen:
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """Raises an error for code with wrong derivatives in Warp: loops not unrolled, and changes of single components."""
+    """Raises an error for code with wrong derivatives in Warp: loops that are not unrolled, and assignments to single
+    components."""
 
     def __init__(self, what: str, most: int = wp.config.max_unroll):
         self._what, self._most = what, most
@@ -264,7 +265,7 @@ def code_words(value: Any) -> str:
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
     """Return lines of text that identify what a value computes. The lines are equal in every process.
 
-    For objects and for a user's modules, ``names`` restricts the lines to these attributes.
+    For objects and for a user's modules, only the attributes ``names`` are included.
     """
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):

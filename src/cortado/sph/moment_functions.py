@@ -31,7 +31,7 @@ def cross_terms_function(precision: Precision) -> Any:
 
 @cache
 def symmetric(precision: Precision) -> SimpleNamespace:
-    """Make Warp functions of symmetric matrices. A matrix is stored as the diagonal and the entries yz, xz and xy.
+    """Make Warp functions of symmetric matrices. A matrix is stored as its diagonal and its components yz, xz and xy.
     ``kind`` is the Warp type, ``pack`` converts a 3 x 3 matrix, and ``times`` multiplies by a vector."""
     vector, matrix, six = precision.vector, precision.matrix, precision.six
 
@@ -63,7 +63,6 @@ def moment_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func
     def whole(diagonal: vector, others: vector) -> matrix:
-        """Return the matrix with this diagonal and these other entries."""
         return change(diagonal + vector(real(0.0), real(0.0), plane), others)
 
     @wp.func

@@ -188,7 +188,8 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 
 @cache
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a moving solid in 2 or 3 dimensions, for its poses before and after a step and its state."""
+    """Make the kernels of a moving solid in 2 or 3 dimensions: for the poses before and after a step, and for the
+    state."""
     real, vector, matrix, of = precision.real, precision.vector, precision.matrix, rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 

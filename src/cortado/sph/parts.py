@@ -65,10 +65,11 @@ class StepContext:
         return {**own, "cell": self.cell, "fractions": self.fractions}, self.fields.named(), self.parameters.named()
 
     def launch(self, kernel: wp.Kernel, *groups: Named, threads: int | None = None, **arguments: Any) -> None:
-        """Launch a kernel over the particles. The context provides what is not in ``arguments`` or ``groups``.
+        """Launch a kernel over the particles. The context provides all arguments that are missing in ``arguments`` and
+        ``groups``.
 
-        A kernel with the argument ``s`` takes it first, and works on particle ``s.first + wp.tid()``, because its
-        launch may be split into ranges of particles. ``threads`` is for kernels without ``s``.
+        A kernel with the argument ``s`` has it as the first argument, and works on particle ``s.first + wp.tid()``,
+        because its launch may be split into ranges of particles. ``threads`` is for kernels without ``s``.
         """
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
@@ -100,7 +101,8 @@ class Shares(Arrays):
     """Terms of particles in the adjoints of parameters (n,), before summation."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
-        """Allocate terms of the parameters ``names``, all 0. Raise `TypeError` for one that particles do not share."""
+        """Allocate terms of the parameters ``names``, all 0. Raise `TypeError` for a parameter without terms of
+        particles."""
         precision, self.known, kinds = layout.precision, layout.known, {}
         of_phases = precision.fractions(layout.phases)
         dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
@@ -134,7 +136,8 @@ class Adjoints:
     def named(self) -> tuple[Named, ...]:
         """Return the adjoints by kernel argument name, such as ``x_bar``.
 
-        Those of parameters over time are sums (members, steps), and those of parameters in ``shares`` terms (n,).
+        Adjoints of parameters over time are sums (members, steps). Adjoints of parameters in ``shares`` are terms of
+        particles (n,), which are summed later.
         """
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
@@ -160,11 +163,11 @@ class Force(Protocol):
     """
 
     shares: tuple[str, ...]
-    """Names of parameters with adjoints that are sums over particles. Adjoint kernels write a term for each particle
-    (n,). Parameters over time have sums (members, steps) instead."""
+    """Names of parameters whose adjoints are sums over particles. Adjoint kernels write a term for each particle (n,).
+    Adjoints of parameters over time are sums (members, steps) instead."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        """Write the sum of ``before`` and this force's acceleration to ``after``. All three are (n,) vectors."""
+        """Write the sum of ``before`` and this force's acceleration to ``after``. Both arrays contain (n,) vectors."""
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         """Write the sum of ``before`` and the tangent of this force's acceleration to ``after``, (n,) vectors."""
@@ -268,7 +271,7 @@ class Carried:
     """Fields of sorted particles that a solver uses in the next step, such as a pressure."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
-        """Allocate the arrays of the fields. Raise `TypeError` for a field without an entry for each particle."""
+        """Allocate the arrays of the fields. Raise `TypeError` for a field without a value for each particle."""
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:
@@ -326,7 +329,8 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Return the Warp module for kernels without a smoothing kernel. Kernels of few scenes need their own ``topic``."""
+    """Return the Warp module for kernels without a smoothing kernel. Kernels that only few scenes use need their own
+    ``topic``."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 

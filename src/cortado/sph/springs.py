@@ -1,6 +1,6 @@
 """Springs of free bodies, and springs and motors at hinges.
 
-A spring connects a point of a free body to a point of a second solid or of space. Its tension is
+A spring connects a point of a free body to a point of a second solid, or to a point fixed in space. The tension is
 
     t = k (l - l_0) + C u,
 
@@ -42,7 +42,7 @@ POSES = (
     ("c", "e", "after", "after"),
     ("R", "E", "turns", "turned"),
 )
-"""Names of the poses before and after a step: kernel arguments for the two solids, and arrays."""
+"""For each pose before or after a step: the kernel arguments for the two solids, and the names of their arrays."""
 TURNED = {name: f"{name}_turn" for name in ("R_0", "R", "E_0", "E")}
 
 

@@ -5,15 +5,16 @@
     S_i = (|n_i|^2 1 - PART n_i n_i) / sqrt(1 + |n_i|^2)
     m_i s^d a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
 
-The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. By
-the choice of N, |n| is 1 in the outermost layer of a cut lattice, and about 0 inside. S pulls along the surface, and
-with PART below 1 a little across it, so that particles do not detach. The force of a pair grows with distance up to
-0.65 h, so that particles of the surface do not clump. Gamma is the tension of the cut lattice without Gamma, times
-`RELAXED`.
+The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. N is
+chosen so that |n| is 1 in the outermost layer of a cut lattice, and about 0 inside. The stress S pulls along the
+surface, and with PART below 1 a little across it, so that particles do not detach. The force of a pair grows with
+distance up to 0.65 h, so that particles of the surface do not clump. Gamma is `RELAXED` times the surface tension that
+a cut lattice would have for sigma / Gamma = 1.
 
 Forces of a pair are opposite, but not parallel to the pair. Momentum is conserved, but angular momentum only
-approximately. Neither of the two forces is the gradient of an energy. Fluids with very low viscosity therefore gain
-energy; see `LEAST_VISCOSITY`. Walls do not take part in surface tension: a surface meets walls at 180 degrees.
+approximately. Neither of the two forces, by curvature or by stress, is the gradient of an energy. Fluids with very low
+viscosity therefore gain energy; see `LEAST_VISCOSITY`. Walls do not take part in surface tension: a surface meets walls
+at 180 degrees.
 """
 
 from collections.abc import Callable
@@ -138,7 +139,8 @@ RELAXED = {2: 1.1, 3: 1.25}
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
 """Smallest support radius for each kind of surface tension [spacings]."""
 LEAST_VISCOSITY = 0.05
-"""Least viscosity of stable drops over sqrt(rho sigma R), with density rho, surface tension sigma and radius R [-]."""
+"""Smallest viscosity of stable drops, divided by sqrt(rho sigma R), with density rho, surface tension sigma and radius
+R [-]."""
 
 
 class SurfaceTension:

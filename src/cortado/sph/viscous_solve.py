@@ -172,6 +172,7 @@ class Solve:
         self._free.multiply(step, known, p, self._own)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add to ``r`` the product of the matrix and the bodies' velocities, with ``still`` particles."""
+        """Multiply the matrix by the bodies' velocities and the particle velocities ``still``. Add the product to
+        ``r``."""
         self._apply(step, known, still)
         add(self._own["product"], r)

@@ -1,14 +1,15 @@
-"""The viscous force as a stress (`cortado.sph.stress_kernels`): explicit, or implicit at the end of a step without
-limit of the time step.
+"""The viscous force as a stress (`cortado.sph.stress_kernels`). The force is explicit, or implicit without a limit on
+the time step.
 
-Let a be the acceleration by all other forces, and g(v) the acceleration by the stress of fluid with velocities v, with
-M and mu of the velocities at the start. The acceleration at the end of a step is a' of
+Let a be the acceleration by all other forces, and g(v) the acceleration by the viscous stress of fluid with velocities
+v. In g, the viscosity mu and the matrix M are those at the start of the step. The acceleration a' at the end of a step
+solves
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
 
-which `cortado.sph.viscous_solve` solves to round-off. B is symmetric and positive in the product sum_i m_i a_i .
-b_i. The viscosity mu belongs to the velocities v at the start, the stress to u = v + dt a' at the end. Derivatives are
-those of the exact solution: tangent and adjoint are one more solve with B each.
+which `cortado.sph.viscous_solve` solves to round-off. B is symmetric and positive in the product sum_i m_i a_i . b_i.
+The viscosity mu is computed from the velocities v at the start, and the stress from u = v + dt a' at the end.
+Derivatives are those of the exact solution: the tangent and the adjoint each need one more solve with B.
 """
 
 from collections.abc import Sequence
@@ -109,7 +110,8 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """Add to the adjoints of the force's inputs, given that of the acceleration and the arrays of `resisted`."""
+        """Add to the adjoints of the force's inputs, given the adjoint of the acceleration and the arrays of
+        `resisted`."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint

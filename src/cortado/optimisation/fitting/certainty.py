@@ -1,12 +1,12 @@
-"""Standard errors of a least-squares estimate with correlated residuals in a frame and from frame to frame.
+"""Standard errors of a least-squares estimate if residuals are correlated within a frame and from frame to frame.
 
 Near the estimate the residuals are r = e - J t. Here e (frames, m) is the noise, J (frames, m, parameters) the
 Jacobian, and t the error of the estimate. The m numbers of a frame are not independent, because neighbouring pixels,
 and all light of a frame, vary together.
 
 1. The correlation of noise at two times is exp(-dt / T), where dt is the difference of the times. The correlation time
-   T reproduces the correlation of the fit's residuals between neighbouring frames (`correlation_time`). A second fit
-   uses frames that are `whitened` in time.
+   T is chosen to reproduce the correlation of residuals in neighbouring frames (`correlation_time`). A second fit uses
+   frames that are `whitened` in time.
 2. Within a frame the noise has an arbitrary covariance C, which is the same for every frame. The covariance of the
    score J^T e is the sum
 
@@ -15,8 +15,8 @@ and all light of a frame, vary together.
    over F frames f and h with whitened residuals r_h. B has F times as many samples as the cluster-robust sum of
    (J_f^T r_f)(J_f^T r_f)^T (Liang and Zeger 1986). The covariance of the estimate is N^-1 B N^-1 with the Hessian
    N = sum_f J_f^T J_f.
-3. B is corrected for the mean part of the noise that the fit absorbed. The degrees of freedom of Student's distribution
-   follow Satterthwaite (1946).
+3. On average the fit absorbs a part of the noise, and B is corrected for this part. The degrees of freedom of
+   Student's distribution follow Satterthwaite (1946).
 4. The correlation time T is uncertain too. The variance of an estimate is proportional to (1 + c) / (1 - c), where c is
    the correlation from frame to frame. The variance of c is (1 - c^2) / n for n independent numbers. To second order,
    B is therefore larger by the factor 1 + 2 / (n (1 - c)) on average.
@@ -70,7 +70,8 @@ class ScoreCovariance:
     frames: float
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Return Satterthwaite's degrees of freedom (1946) for a combination ``direction`` (p,) of parameters."""
+        """Return Satterthwaite's degrees of freedom (1946) for the linear combination of parameters along ``direction``
+        (p,)."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
@@ -102,7 +103,8 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """Return the number F (1 - c) / (1 + c) of independent frames, for F frames with a correlation c of neighbours."""
+    """Return the effective number of independent frames, F (1 - c) / (1 + c). F is the number of frames, and c is the
+    correlation of the noise in neighbouring frames."""
     c = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
     return float(len(times) * (1.0 - c) / (1.0 + c))
 
@@ -143,7 +145,8 @@ class FittedPart:
     part: Part
     weighting: Weighting
     residuals: np.ndarray
-    """Predicted minus measured numbers (frames, m), in the unit of the observation. They are 0 for ignored numbers."""
+    """Predicted minus measured numbers (frames, m), in the unit of the observation. The residuals of ignored numbers
+    are 0."""
     spread: float
     samples: float
     frames: float
@@ -164,7 +167,7 @@ class Certainty:
     hessian: np.ndarray
     """Hessian (free, free), computed from the weighted Jacobians."""
     covariance: np.ndarray
-    """Covariance (free, free) of the coordinates."""
+    """Covariance (free, free) of the fitted coordinates."""
     degrees_of_freedom: np.ndarray
     """Degrees of freedom (free,) of Student's t-distribution."""
     scores: tuple[ScoreCovariance, ...]
@@ -172,7 +175,8 @@ class Certainty:
 
     @classmethod
     def of(cls, problem: LeastSquares, at: Linearised, weights: Weights) -> "Certainty":
-        """Compute the certainty at a point. Raises `ComputationError` for undetermined combinations of parameters."""
+        """Compute the certainty at a point. Raises `ComputationError` if a combination of parameters is not
+        determined."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()

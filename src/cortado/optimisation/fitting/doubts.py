@@ -1,7 +1,8 @@
-"""Sentences of doubt about a fitted model if its residuals are larger than the noise, with possible causes.
+"""Sentences of doubt about a fitted model if its residuals are larger than the noise. The sentences name possible
+causes.
 
-Causes are a trend, a late clock, a wrong density, or slipping walls. Each cause changes the predictions along a
-direction. Its size is fitted together with the parameters, with an error bar.
+Possible causes are a trend, a late clock, a wrong density, or slipping walls. Each cause changes the predictions along
+a direction. The size of the change is fitted together with the parameters, with an error bar.
 """
 
 import warnings
@@ -20,13 +21,16 @@ from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE_IN_MOTION = 2.0
-"""Ratio of the residuals of changing numbers to the residuals of constant numbers that causes a warning."""
+"""A sentence warns if the residuals of changing predictions exceed the residuals of constant predictions by this
+factor."""
 EXACT = 1e-4
-"""Greatest negligible residuals, as those of simulated measurements, relative to the largest measured number."""
+"""Residuals below this fraction of the largest measured number are negligible, for instance in simulated
+measurements."""
 
 
 def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> tuple[str, ...]:
-    """Return sentences of doubt about a fit, unless the residuals look like noise and determine the parameters."""
+    """Return sentences of doubt about a fit. There are none if the residuals look like noise and determine the
+    parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
@@ -67,8 +71,9 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return the root mean square residuals of numbers with constant predictions, such as the background of a video,
-    and of the remaining numbers. With fewer than 20 constant predictions, return infinity and 0."""
+    """Return the root mean square residuals of numbers with constant predictions, such as the background of a video.
+    The second result is the same for all other numbers. With fewer than 20 constant predictions, return infinity and 0.
+    """
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
     still = counted & (change <= 0.01 * np.max(change[counted], initial=0.0))
@@ -155,7 +160,8 @@ def explained(
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences on the density of the fluid and the slip of the container. They need additional runs."""
+    """Return sentences on the density of the fluid and the slip of the container. The function needs
+    additional runs."""
     values, found = problem.coordinates.values(at.u), list[str]()
 
     def by_density(experiment: Experiment, own: Arrays) -> Arrays:

@@ -21,7 +21,7 @@ from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
 
 ROOM = 16
-"""Number of additional steps of a run for a late clock."""
+"""Number of additional steps of a run, because a clock may be late."""
 
 
 @fixed
@@ -78,13 +78,15 @@ class Experiment:
 
     @property
     def unseen(self) -> Arrays:
-        """Return a mask for each parameter of `start`. It is true for components that do not affect any measurement."""
+        """Return a mask for each parameter of `start`. The mask is true for components that do not affect any
+        measurement."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """Return the bounds of each calibrated clock [s]: half of the measurement's duration before and after 0."""
+        """Return the bounds of each calibrated clock [s]. The bounds are half of the measurement's duration before and
+        after the clock's initial value."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -97,7 +99,8 @@ class Experiment:
         return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
-        """Return this experiment with new measured numbers (frames, m) by observation name. All else is shared."""
+        """Return this experiment with new measured numbers (frames, m) by observation name. The two experiments share
+        all other data."""
         found = object.__new__(Experiment)
         again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}

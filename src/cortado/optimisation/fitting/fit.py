@@ -87,7 +87,8 @@ class Fit:
     coordinate_covariance: np.ndarray = field(repr=False)
     """Covariance of the coordinates (free, free)."""
     naive_covariance: np.ndarray = field(repr=False)
-    """Covariance (free, free), far too small, as if all measured numbers were independent. It serves for comparison."""
+    """Covariance (free, free) under the wrong assumption that all measured numbers are independent. The values are far
+    too small and serve only for comparison."""
     degrees_of_freedom: np.ndarray = field(repr=False)
     """Degrees of freedom of Student's t-distribution (free,)."""
     parts: tuple[FittedPart, ...] = field(repr=False)
@@ -108,7 +109,7 @@ class Fit:
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     problem: LeastSquares | None = field(default=None, repr=False)
     at: Linearised | None = field(default=None, repr=False)
-    """End of the search, with the Jacobian for the error bars. It is None in pickled fits."""
+    """Point at the end of the search, with the Jacobian for the error bars. The value is None in pickled fits."""
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "problem": None, "at": None}
@@ -131,7 +132,8 @@ class Fit:
 
     @property
     def standard_errors(self) -> dict[str, Any]:
-        """Return the standard errors by name, in the shape and unit of each parameter, 0 for numbers not fitted."""
+        """Return the standard errors by name, in the shape and unit of each parameter. The error of a number that is
+        not fitted is 0."""
         return _plain(self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0))
 
     @property
@@ -142,7 +144,8 @@ class Fit:
 
     @property
     def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of labels with strongly correlated estimates, each with the correlation, which is above 0.9."""
+        """Return pairs of labels with strongly correlated estimates, together with the correlation. Its absolute value
+        is above 0.9."""
         found, labels = self.correlation, self.labels
         pairs = combinations(range(len(labels)), 2)
         return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > 0.9)
@@ -182,7 +185,8 @@ class Fit:
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
     def log_posterior(self, u: Any) -> float:
-        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,), by a run.
+        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,). The function
+        computes one run.
 
         The prior is flat in the coordinates within the bounds. Coordinates of positive numbers are logarithms. The
         result is -inf outside the bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to
@@ -190,8 +194,8 @@ class Fit:
 
         The result is minus half of the weighted sum of squares, relative to the minimum. With correlated noise the
         error bars are longer than the sum of squares suggests. Let V be the covariance of the estimate, and N the
-        Hessian of the sum of squares. Distances from the estimate are multiplied by a matrix W with W^T N W = V^-1.
-        This is the curvature adjustment of Ribatet, Cooley and Davison (2012).
+        Hessian of the sum of squares. Distances from the estimate are multiplied by a matrix W with W^T N W = V^-1. The
+        method is the curvature adjustment of Ribatet, Cooley and Davison (2012).
         """
         point = as_numbers("u", u)
         if point.shape != self.u.shape:
@@ -256,7 +260,8 @@ def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error. The error has two digits if the first one is 1 to 3, or else one."""
+    """Format a value and its standard error. The error is rounded to two digits if its first digit is 1 to 3, and
+    otherwise to one digit."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -291,14 +296,15 @@ def fit(
     Args:
         experiments: a `measured.Experiment`, or several with the same parameters.
         start: initial values of the fitted parameters, by name. Positive parameters, such as a viscosity, are searched
-            by their logarithm. Parameters that videos calibrate are added automatically, with the cameras' values.
-        bounds: by name, (lower, upper). Each is a number, an array in the shape of the parameter, or None. A number
-            with two equal bounds is not searched.
+            by their logarithm. Parameters that videos calibrate are added automatically. Their initial values are the
+            cameras' values.
+        bounds: pairs (lower, upper) by parameter name. A bound is a number, an array in the shape of the parameter, or
+            None. A number with two equal bounds is not fitted.
         iterations: greatest number of trial points of each of the two fits.
         on_trial: function that is called after each trial point.
         starts: number of starts. The default is one start, and three more if the first fit ends in doubt. Additional
             starts are chosen within the bounds by forward runs. Positive numbers without bounds are varied by a factor
-            of 100 in both directions. The fit with the least residuals is returned. Its ``tried`` lists the ends of all
+            of 100 in both directions. The fit with the least residuals is returned. Its attribute ``tried`` lists all
             searches.
 
     Raises InputError for unsuitable start, bounds or experiments, DivergedError if the run at the start diverges, and

@@ -1,9 +1,10 @@
 """Minimise the sum of squares in few runs, by Gauss-Newton steps. The Jacobian is estimated from earlier runs.
 
-Predictions of particle simulations are rough functions of a parameter. The derivative at a point may be much steeper
-than the change over a standard error. Error bars from the derivative are then too small. At the end of a search,
-`over_the_bars` therefore checks the derivatives by predictions two standard errors away. Bad derivatives are replaced
-by differences over the width of the error bars.
+Predictions of particle simulations are rough functions of a parameter. The derivative with respect to a parameter may
+be much greater than the mean slope over one standard error of the parameter. Error bars that are computed from this
+derivative are then too small. At the end of a search, `over_the_bars` therefore runs simulations two standard errors
+away from the minimum. If the derivatives do not predict the results, finite differences over two standard errors
+replace the derivatives.
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ GREATEST_LOGARITHM = 1.0
 MOST_FAILURES = 3
 """Number of successive failed trial points before the Jacobian is estimated again."""
 REACH = 2.0
-"""Distance of the predictions that check derivatives [standard errors]."""
+"""Distance from the minimum at which the derivatives are checked [standard errors]."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +30,14 @@ class Searched:
     at: Linearised
     """Last point of the search, with an estimated Jacobian."""
     next: np.ndarray
-    """Next point of the search (free,), which was not run."""
+    """Next trial point of the search (free,). No simulation was run at this point."""
     gain: float
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) -> tuple[Linearised, bool]:
-    """Minimise the sum of squares, at first with estimated Jacobians and later with derivatives by forward mode. Return
-    the minimum and True. If there are not enough trial points, return the lowest point and False."""
+    """Minimise the sum of squares, first with estimated Jacobians and then with forward-mode derivatives. Return the
+    minimum and True. If the minimum is not found with ``trials`` trial points, return the lowest point and False."""
     for _ in range(4):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, 9.0 / squares)  # a decrease of three standard errors
@@ -58,10 +59,11 @@ def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) 
 def search(
     problem: LeastSquares, at: Linearised, weights: Weights, trials: int, enough: float, fixed: Sequence[int] = ()
 ) -> Searched:
-    """Reduce the sum of squares by steps of more than ``enough``, without a change of the coordinates ``fixed``.
+    """Reduce the sum of squares until the next step would reduce it by less than the fraction ``enough``. The
+    coordinates ``fixed`` stay constant.
 
-    A trial point takes a forward run, and the Jacobian is estimated from all trial points. Steps are damped (Levenberg
-    1944, Marquardt 1963) after a point without a reduction or with a diverged run.
+    Each trial point needs one forward run. The Jacobian is estimated from all trial points. If a trial point does not
+    reduce the sum of squares, or if its run diverges, the next step is damped (Levenberg 1944, Marquardt 1963).
     """
     points, base = TrialPoints(problem, weights, at), 0
     failures, damping, lowest = 0, 0.0, problem.sum_of_squares(at.residuals, weights)
@@ -98,7 +100,8 @@ def search(
 def next_point(
     problem: LeastSquares, at: Linearised, weights: Weights, damping: float = 0.0, fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, float]:
-    """Minimise the linear model's sum of squares within the bounds. Return the point (free,) and the decrease."""
+    """Minimise the sum of squares of the linear model within the bounds. Return the minimum (free,) and the decrease of
+    the sum of squares."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
@@ -118,8 +121,9 @@ def next_point(
 
 
 def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tuple[Linearised, bool | None]:
-    """Check the derivatives at the end of a search. If the check succeeds, return the point and None. If it fails,
-    return the point with differences over the width of the error bars, and whether the differences converged."""
+    """Check the derivatives at the end of a search. If the check succeeds, return the point and None. If the check
+    fails, compute finite differences over `REACH` standard errors. Then return the point with the new Jacobian, and
+    True if the differences converged."""
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -139,7 +143,8 @@ def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tu
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return independent moves by `REACH` standard errors as columns (free, free), at most as long as a search step."""
+    """Return uncorrelated displacements of `REACH` standard errors, as the columns of a matrix (free, free). A
+    displacement is at most as long as a step of the search."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.by_logarithm
@@ -148,7 +153,7 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray
 
 
 def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: np.ndarray) -> bool:
-    """Test whether the derivatives predict the residuals at the end of an axis."""
+    """Test whether the Jacobian predicts the residuals after the displacement ``axis``."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= 1e-5 * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
         return True
@@ -165,9 +170,10 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: 
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Weights, axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """Return the point with a Jacobian of differences along the axes, and the points that were run.
+    """Return the point with a Jacobian of finite differences along the axes. Also return all points of the differences.
 
-    The smallest of both one-sided differences and the central one is used: the point may lie on a kink.
+    Of the two one-sided differences and the central difference, the smallest is used, because the point may lie on a
+    kink.
     """
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
@@ -187,7 +193,8 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Return the point moved by ``shift`` within the bounds, with its Jacobian, or nothing if its run diverges."""
+    """Run the simulations at the point displaced by ``shift``, within the bounds. Return an empty list if a run
+    diverges."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -196,15 +203,16 @@ def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Lin
 
 
 def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
-    """Return the mean logarithm of the residuals' size. Gaussian noise is most likely where it is least."""
+    """Return the mean logarithm of the residuals' size. For Gaussian noise, the likelihood is greatest where this mean
+    is smallest."""
     counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
     return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
 
 
 def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
-    """Return at most ``count`` points (free,) of a Sobol sequence, best first. The sequence covers the range between
-    the bounds. Positive numbers without bounds are varied by a factor of 100 in both directions, and the remaining
-    numbers are not varied."""
+    """Return at most ``count`` starting points (free,) from a Sobol sequence, with the smallest `misfit` first. The
+    points lie between the bounds. Positive parameters without bounds vary by a factor of 100 up and down. Other
+    parameters without bounds do not vary."""
     from scipy.stats import qmc
 
     start, (lower, upper) = problem.coordinates.start, problem.coordinates.bounds

@@ -1,9 +1,9 @@
 """The least-squares problem of several experiments, as a function of one vector, and its Jacobians.
 
-The vector has the fitted numbers, or logarithms of positive numbers. The Jacobian is computed only at the first point.
-At trial points it is estimated by the slopes of a Kriging interpolation of the residuals (Sacks, Welch, Mitchell and
-Wynn 1989). The interpolation is a linear function plus a random function with Matérn covariance of index 7/2. The width
-of the covariance is chosen by maximum likelihood.
+The vector contains the values of the fitted parameters, or the logarithms of positive values. The Jacobian is computed
+only at the first point. At trial points the Jacobian is the slope of a Kriging interpolation of the residuals (Sacks,
+Welch, Mitchell and Wynn 1989). The interpolation is a linear function plus a random function with Matérn covariance of
+index 7/2. The width of the covariance is chosen by maximum likelihood.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,15 +26,18 @@ TINY = 1e-300
 
 @dataclass(frozen=True)
 class Coordinates:
-    """The conversion between parameters and the coordinates of a search. All parameters have (all,) numbers in total.
-    Numbers with different lower and upper bounds are fitted (free,)."""
+    """The conversion between parameters and the coordinates of a search.
+
+    Arrays of shape (all,) contain the components of all parameters. Arrays of shape (free,) contain the fitted
+    components, whose lower and upper bounds differ.
+    """
 
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
     at_start: np.ndarray
     """Initial values (all,), in the units of the parameters."""
     logarithmic: np.ndarray
-    """Mask of numbers that are fitted by their logarithm (all,)."""
+    """Mask (all,) of the components that are fitted by their logarithm."""
     lower: np.ndarray
     upper: np.ndarray
 
@@ -43,7 +46,8 @@ class Coordinates:
         cls, start: Mapping[str, Any], positive: Iterable[str], bounds: Bounds | None, unseen: Arrays | None = None
     ) -> "Coordinates":
         """Make coordinates for initial values. ``positive`` parameters are fitted by their logarithm if all of their
-        numbers are above 0. ``unseen`` numbers are not fitted. Raises `InputError` for unsuitable arguments."""
+        components are above 0. ``unseen`` is a mask of components that are not fitted. Raises `InputError` for
+        unsuitable arguments."""
         values = checked_start(start)
         by_logarithm = {name for name in positive if name in values and (values[name] > 0.0).all()}
         ends = checked_bounds({} if bounds is None else bounds, values)
@@ -65,17 +69,17 @@ class Coordinates:
 
     @property
     def free(self) -> np.ndarray:
-        """Return a mask of fitted numbers (all,)."""
+        """Return a mask (all,) of the fitted components."""
         return self.lower < self.upper
 
     @property
     def by_logarithm(self) -> np.ndarray:
-        """Return a mask (free,) of the fitted numbers that are fitted by their logarithm."""
+        """Return a mask (free,) of the components that are fitted by their logarithm."""
         return self.logarithmic[self.free]
 
     @property
     def labels(self) -> list[str]:
-        """Return the names of the fitted numbers. Numbers of larger parameters have an index, as in "gravity[1]"."""
+        """Return the names of the fitted components. Components of an array have an index, as in "gravity[1]"."""
         found = list[str]()
         for name, shape in zip(self.names, self.shapes, strict=True):
             found += [f"{name}[{', '.join(map(str, k))}]" if shape else name for k in np.ndindex(*shape)]
@@ -97,12 +101,12 @@ class Coordinates:
         return np.where(is_log, np.log(np.where(is_log, chosen, 1.0)), chosen)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Return the fitted numbers (free,) at coordinates u (free,), in the units of the parameters."""
+        """Return the fitted components (free,) at coordinates u (free,), in the units of the parameters."""
         with np.errstate(over="ignore"):  # an interval may have no upper end
             return np.where(self.by_logarithm, np.exp(np.where(self.by_logarithm, u, 0.0)), u)
 
     def slopes(self, u: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the numbers with respect to their coordinates (free,)."""
+        """Return the derivative (free,) of each fitted component with respect to its coordinate."""
         return np.where(self.by_logarithm, self.numbers(u), 1.0)
 
     def values(self, u: np.ndarray) -> Arrays:
@@ -113,7 +117,8 @@ class Coordinates:
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
     def directions(self, u: np.ndarray) -> list[Arrays]:
-        """Return the derivative of the parameters with respect to each coordinate. Zero derivatives are left out."""
+        """Return the derivatives of the parameters with respect to each coordinate. Parameters with zero derivative are
+        left out."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
             whole = np.zeros(len(self.at_start))
@@ -122,14 +127,16 @@ class Coordinates:
         return found
 
     def spread(self, free: np.ndarray, otherwise: float | np.ndarray) -> Arrays:
-        """Return fitted numbers (free,) as arrays by name. Numbers that are not fitted are set to ``otherwise``."""
+        """Convert fitted components (free,) to parameter arrays by name. Components that are not fitted are set to
+        ``otherwise``."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Remove the correlation of values (frames, ...) between successive frames. Standard deviations do not change."""
+    """Remove the correlation between successive frames from values (frames, ...). The standard deviation does not
+    change."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -138,7 +145,8 @@ def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> 
 
 @dataclass(frozen=True)
 class Part:
-    """An observation of an experiment. ``label`` has its name, and the experiment's number if there are several."""
+    """An observation of an experiment. ``label`` contains the name of the observation. With several experiments, the
+    label also contains the number of the experiment."""
 
     experiment: int
     name: str
@@ -154,7 +162,7 @@ class Weighting:
     correlation_time: float = 0.0
 
     def of(self, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Whiten values (frames, ...) in time, and divide them by the scale."""
+        """Remove the correlation of values (frames, ...) over time (`whitened`), and divide the values by the scale."""
         return whitened(values, times, self.correlation_time) / self.scale
 
 
@@ -168,7 +176,7 @@ class Linearised:
 
     u: np.ndarray
     residuals: list[np.ndarray]
-    """Predicted minus measured numbers of each observation (frames, m). They are 0 for ignored numbers."""
+    """Predicted minus measured values (frames, m) of each observation. The residual of an ignored measurement is 0."""
     jacobians: list[np.ndarray]
     """Jacobian of each observation (frames, m, free)."""
 
@@ -192,7 +200,8 @@ class LeastSquares:
             for name, one in experiment.observations.items()
         ]
         self.runs = self.tangents = self.refused = 0
-        """Number of forward runs, followed by the numbers of forward-mode runs and of diverged runs."""
+        """Number of forward runs. ``tangents`` is the number of forward-mode derivatives, and ``refused`` is the number
+        of diverged runs."""
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
         """Return the residuals of each observation at coordinates u. Raises `DivergedError` if a run diverges."""
@@ -203,9 +212,9 @@ class LeastSquares:
         return [np.nan_to_num(predicted - measured, nan=0.0) for predicted, measured in each]
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """Return residuals and estimated Jacobians at a point. Derivatives with respect to positive numbers are
-        differences, because forward runs are cheaper than forward-mode runs. Raises `DivergedError` if a run diverges.
-        """
+        """Return residuals and estimated Jacobians at a point. Derivatives with respect to logarithms of parameters are
+        finite differences, because forward runs are cheaper than forward-mode runs. Raises `DivergedError` if a run
+        diverges."""
         positive = self.coordinates.by_logarithm
         at = self.linearised(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
@@ -220,7 +229,8 @@ class LeastSquares:
         return at
 
     def linearised(self, u: np.ndarray, columns: Iterable[int] | None = None) -> Linearised:
-        """Return residuals and Jacobians at a point. The derivatives of coordinates outside ``columns`` are 0."""
+        """Return residuals and Jacobians at a point. Derivatives with respect to coordinates outside
+        ``columns`` are 0."""
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
         directions = {number: every[number] for number in (range(len(u)) if columns is None else columns)}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
@@ -256,7 +266,8 @@ class LeastSquares:
             raise
 
     def values_of(self, experiment: int, values: Arrays) -> Arrays:
-        """Return the values of an experiment's parameters, without those of observations in other experiments."""
+        """Select the values of one experiment's parameters. Parameters that only other experiments have are
+        left out."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
 
@@ -290,7 +301,8 @@ class TrialPoints:
 
 
 def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
-    """Return the weights (d, points) of values at points ``x`` (points, d) in the slopes at point ``number``."""
+    """Return the weights (d, points) of a weighted sum that estimates the gradient at point ``number`` from values at
+    the points ``x`` (points, d)."""
     from scipy.linalg import null_space
     from scipy.spatial.distance import cdist
 

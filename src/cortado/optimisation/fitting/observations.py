@@ -54,14 +54,14 @@ class Observation(Protocol):
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return the initial values of the observation's parameters, such as the position of a camera. The parameter
-        "start" is a clock [s], which is added to the times of the frames."""
+        """Return the initial values of the observation's parameters, such as the position of a camera. The value of the
+        parameter "start" [s] is added to the times of the frames."""
 
     def value(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the predicted numbers (m,) for a state. ``own`` has the values of the observation's parameters."""
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives of `value` (m, directions) along directions."""
+        """Return the derivatives (m, directions) of `value` along the given directions."""
 
 
 class Again:
@@ -84,7 +84,7 @@ class Frames:
     steps: np.ndarray
     """Number of steps before each frame (frames,)."""
     shares: np.ndarray
-    """Interpolation weight of the later state, from 0 to 1 (frames,)."""
+    """Weight (frames,) of the later state in the interpolation, from 0 to 1."""
 
     @classmethod
     def of(cls, times: np.ndarray, time_step: float, steps: int) -> "Frames":
@@ -106,11 +106,13 @@ class Frames:
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` has readings by step."""
+        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` maps step numbers to
+        readings."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return readings interpolated to the frames (frames, ...). ``read`` has readings by step number."""
+        """Return readings interpolated to the times of the frames (frames, ...). ``read`` maps step numbers to
+        readings."""
         last = max(read)
         after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
@@ -119,7 +121,8 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
-    """Return the parameter of a calibrated clock. If ``alone``, further names in ``calibrate`` raise `InputError`."""
+    """Return the parameter "start" with the value ``start`` if ``calibrate`` contains its name. If ``alone`` is true,
+    any other name in ``calibrate`` raises `InputError`."""
     for name in calibrate if alone else ():
         if name != CLOCK:
             raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
@@ -127,7 +130,8 @@ def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Return times plus ``clock`` [s], measured numbers and noise. Raises `InputError` for unsuitable arrays."""
+    """Return the times plus ``clock`` [s], the measured values, and the noise as checked arrays. Raises `InputError`
+    for unsuitable arrays."""
     late = as_one_number("clock", clock)
     if not np.isfinite(late):
         raise InputError(f"clock is {late:g}, but must be a finite number of seconds.")
@@ -204,7 +208,7 @@ class Video:
 
     @property
     def unseen(self) -> Mapping[str, np.ndarray]:
-        """Return a mask for each camera parameter. It is true for components that do not affect the picture."""
+        """Return a mask for each camera parameter. A mask is true for components that do not affect the picture."""
         return self.calibration.unseen
 
     def picture(self, at: Snapshot, own: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -283,7 +287,8 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives along directions. They are computed by adjoints: sensors have no forward mode."""
+        """Return the derivatives along directions. Adjoints compute the derivatives, because sensors have no forward
+        mode."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
@@ -300,8 +305,8 @@ class Tracks:
     X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
 
     where X is the position of the tracer, and x_i are the positions of the particles and their periodic images. The
-    weights w_i are Wendland's function (1995) within the support radius at the start, normalised to sum 1. Paths are
-    not wrapped: the position of a tracer that crossed a periodic box is one period further.
+    weights w_i are values of Wendland's function (1995) of the distances at the start, divided by their sum. Positions
+    are not wrapped at periodic boundaries.
 
     Example: ``tracks = cortado.measured.Tracks(simulation, first, times, positions, noise=0.001)``
     """

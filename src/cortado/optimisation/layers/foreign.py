@@ -1,7 +1,7 @@
-"""Python functions of arrays in compiled JAX programs, by the foreign function interface of XLA.
+"""Call Python functions of arrays from compiled JAX programs, through the foreign function interface of XLA.
 
-XLA calls one function of this module with the addresses of buffers. Arrays of one data type are passed in one buffer,
-because a call costs more for each buffer than for its numbers. The structs of the interface are those of Warp.
+XLA calls one function of this module with the addresses of buffers. Arrays of one data type are concatenated in one
+buffer, because the cost of a call grows with the number of buffers. Warp defines the C structs of the interface.
 """
 
 import ctypes
@@ -29,20 +29,20 @@ from cortado.rollout.device_states import flat_of
 Sizes = tuple[int, ...]
 Function = Callable[[list[Array]], Sequence[Array]]
 TARGET = f"cortado_{uuid4().hex}"
-"""Name of the function for XLA. It is new in each process, because JAX may keep compiled programs on disk."""
+"""Name of the function in XLA. Each process uses a new name, because JAX may store compiled programs on disk."""
 KEPT = 8
 
 
 class ForeignFunction:
-    """A Python function of arrays for compiled programs. It gets views of the buffers of XLA."""
+    """A Python function of arrays for compiled programs. The arguments of the function are views of XLA's buffers."""
 
     def __init__(self, function: Function):
         self._function, self._number = function, next(_NUMBERS)
         finalize(self, _let_go, self._number)
 
     def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        """Call the function with traced ``arrays``. ``shapes`` are the shapes of its results, and ``results`` have the
-        shapes and data types of what is returned."""
+        """Call the function with traced ``arrays``. The function returns arrays with the given ``shapes``. The call
+        returns arrays with the shapes and data types of ``results``."""
         given, made = Packing([(a.shape, a.dtype) for a in arrays]), Packing([(r.shape, r.dtype) for r in results])
         own = Packing(list(zip(shapes, (result.dtype for result in results), strict=True)))
         _CALLS[self._number] = self._function, given, own
@@ -52,12 +52,12 @@ class ForeignFunction:
 
 
 class Packing:
-    """The places of arrays with known shapes and data types in one flat array for each data type."""
+    """A layout of arrays with known shapes. All arrays of one data type are concatenated in one flat array."""
 
     def __init__(self, kinds: Sequence[tuple[Sizes, Any]]):
         self._shapes = [shape for shape, _ in kinds]
         self.groups: dict[str, list[int]] = {}
-        """Numbers of the arrays of each data type."""
+        """Indices of the arrays of each data type."""
         for k, (_, dtype) in enumerate(kinds):
             self.groups.setdefault(str(dtype), []).append(k)
         sizes = {dtype: [prod(self._shapes[k]) for k in group] for dtype, group in self.groups.items()}
@@ -65,8 +65,9 @@ class Packing:
         self._kept: dict[tuple[int, ...], tuple[list[Any], list[Any]]] = {}
 
     def at(self, addresses: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any]]:
-        """Return the flat arrays at the addresses of buffers, and views of them as `cut` returns them: NumPy arrays if
-        ``device`` is None, or Warp arrays. Programs use the same few buffers again and again."""
+        """Return the flat arrays at the addresses of buffers, and their views by `cut`. The arrays are NumPy arrays if
+        ``device`` is None, and Warp arrays otherwise. Results are cached, because programs use the same few buffers
+        again."""
         return kept_or_made(self._kept, addresses, lambda _: self._made(addresses, device), KEPT)
 
     def _made(self, addresses: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any]]:
@@ -84,8 +85,8 @@ class Packing:
         return found
 
     def fill(self, whole: Sequence[Any], views: Sequence[Any], found: Sequence[Array]) -> None:
-        """Write arrays to their places in flat arrays with the given views. Arrays on a GPU that lie one after the
-        other are copied at once."""
+        """Copy the arrays ``found`` to flat arrays with the given views. Arrays that are adjacent in GPU memory are
+        copied together."""
         for result, group in zip(whole, self.groups.values(), strict=True):
             rest = group
             if isinstance(result, wp.array):
@@ -124,7 +125,6 @@ def _array_at(address: int, size: int, dtype: str, device: Any) -> Any:
 
 
 def _call(frame: Any, device: Any) -> None:
-    """Call the function whose number is in a frame of XLA with the arrays of the frame."""
     scalar = ctypes.cast(frame.attrs.attrs[0], ctypes.POINTER(xla_ffi.XLA_FFI_Scalar)).contents
     function, given, made = _CALLS[ctypes.cast(scalar.value, ctypes.POINTER(ctypes.c_int64)).contents.value]
     _, arrays = given.at(_addresses(frame.args.args, frame.args.size), device)
@@ -143,7 +143,8 @@ def _call_on_cpu(frame: Any) -> None:
 
 
 def _call_on_gpu(frame: Any) -> None:
-    """Call a function with work in a separate stream, which waits for the program's stream and is waited for."""
+    """Call a function in a separate stream, which is synchronised with the program's stream before and after
+    the call."""
     with WARP:
         wp.init()
         ordinal = xla_ffi.get_device_ordinal_from_callframe(frame)
@@ -156,13 +157,12 @@ def _call_on_gpu(frame: Any) -> None:
 
 @cache
 def _streams(ordinal: int, address: int) -> tuple[Any, Any]:
-    """Return the Warp streams of a program and of its calls."""
     device = wp.get_cuda_device(ordinal)
     return wp.Stream(device, cuda_stream=address), wp.Stream(device)
 
 
 def _handler(call: Callable[[Any], None]) -> Any:
-    """Make a function for XLA that answers questions about itself, calls ``call`` with a frame, and returns errors."""
+    """Make a callback for XLA that runs ``call`` and reports errors to XLA."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(xla_ffi.XLA_FFI_CallFrame))
     def handle(pointer: Any) -> Any:

@@ -47,10 +47,10 @@ LOSS, READING, PICTURE = "loss", "reading", "picture"
 
 
 class LayerParameters:
-    """A converter of a layer's parameters for problems and steppers.
+    """A converter between the parameters of a layer and the parameters of a problem or stepper.
 
-    ``each`` is True if the simulation is a batch of evaluations of a layer. All arrays then have one entry for each
-    evaluation. If ``each`` is False, a batch accepts parameters in all shapes of `docs/batches.md`.
+    ``each`` is True if the simulation is a batch that evaluates one layer several times. The first axis of every array
+    is then the evaluation. If ``each`` is False, a parameter of a batch may have any shape in `docs/batches.md`.
     """
 
     def __init__(self, simulation: Simulation, steps: int, each: bool):
@@ -84,7 +84,8 @@ class LayerParameters:
         return array.reshape(()) if is_number else array
 
     def adjoints(self, found: Mapping[str, Array], values: Arrays) -> Named:
-        """Return derivatives in the shapes of ``values``. If scenes share a value, their derivatives are summed."""
+        """Return derivatives in the shapes of ``values``. If scenes share a value, the derivatives of these scenes are
+        summed."""
         shared = {}
         for name, bar in found.items():
             if isinstance(bar, np.ndarray):
@@ -185,7 +186,8 @@ class Evaluation:
         return self._found
 
     def along(self, dots: Named) -> Any:
-        """Return the derivative of the loss along tangents. Without a given estimator, forward mode is used."""
+        """Return the derivative of the loss along the tangents ``dots``. Without a gradient estimator, forward mode is
+        used."""
         if isinstance(self._estimator, Exact) and not self._with_state and self._found is None:
             return self._problem.tangent(self.values, part(dots, PARAMETER))
         terms = [self.gradient[name] * dot for name, dot in dots.items()]

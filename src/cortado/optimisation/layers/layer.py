@@ -31,7 +31,7 @@ STATE, PARAMETER = "state ", "parameter "
 """Prefixes of the names of arrays, for fields of a state and for parameters."""
 POSITIONS = (STATE + "positions", "positions")
 LAST_STEP = "time_step"
-"""Name of the length of the previous time step [s], for scenes with adaptive time steps."""
+"""Name of the array with the length of the previous time step [s], for scenes with adaptive time steps."""
 KEPT = 2
 Array = Any
 """A Warp or NumPy array of numbers. A scalar has the shape () or (1,)."""
@@ -42,7 +42,7 @@ V = TypeVar("V")
 
 
 class Layer(ABC):
-    """A differentiable function of named arrays in one precision. It does not modify its arguments."""
+    """A differentiable function of named arrays in one precision. A layer does not modify its arguments."""
 
     real: type
     device: Any
@@ -66,17 +66,17 @@ class Layer(ABC):
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
         """Return the results of the layer. If ``keep`` is true, also return a residual for `pull` and `push`. The next
-        call of the layer may overwrite Warp arrays."""
+        call of the layer may overwrite the returned Warp arrays."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
         """Compute the vector-Jacobian product: return the adjoints of all arguments, given the adjoints of the results.
-        Missing names count as 0."""
+        Missing adjoints count as 0."""
 
     @abstractmethod
     def push(self, residual: Any, dots: Named) -> Named:
         """Compute the Jacobian-vector product: return the tangents of the results, given the tangents of the arguments.
-        Missing names count as 0."""
+        Missing tangents count as 0."""
 
     def check_mapped(self) -> None:
         """Raise `InputError` if `many` is unavailable."""
@@ -97,13 +97,15 @@ class Layer(ABC):
 
 @dataclass(frozen=True)
 class Lost:
-    """The residual of a diverged evaluation, with the shapes of its arrays and the reason."""
+    """The residual of a diverged evaluation. ``given`` contains the shapes of the arguments, and ``why`` is
+    the reason."""
 
     given: Shapes
     why: str
 
     def along(self, of: Named, shapes: Shapes) -> Named:
-        """Return derivatives with the given ``shapes``. They are 0 if all arrays in ``of`` are 0, or else NaN."""
+        """Return derivatives with the given ``shapes``. Derivatives are 0 if all arrays in ``of`` are 0. Otherwise the
+        derivatives are NaN."""
         number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
         return {name: np.full(shape, number) for name, shape in shapes.items()}
 
@@ -183,14 +185,14 @@ def rows(given: Named, chosen: int | np.ndarray) -> dict[str, Array]:
 
 
 def stacked(found: Iterable[Named]) -> dict[str, Array]:
-    """Stack the arrays of several tables by name, along a new first axis. Each table is copied as it comes, because the
-    next evaluation of a layer may overwrite it."""
+    """Stack the arrays of several dictionaries by name, along a new first axis. Each dictionary is copied at once,
+    because the next evaluation of a layer may overwrite its arrays."""
     tables = [copied(table) for table in found]
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
 
 def copied(found: Named) -> Named:
-    """Copy the Warp arrays of a table."""
+    """Return a copy of a dictionary in which all Warp arrays are copied."""
     return {name: wp.clone(array) if isinstance(array, wp.array) else array for name, array in found.items()}
 
 
@@ -214,7 +216,7 @@ def _stack(arrays: list[Array]) -> Array:
 
 
 class NamedStates(HostStates):
-    """A converter between states of a simulation and named arrays, for states and derivatives.
+    """A converter between states of a simulation and named arrays. Derivatives of states are converted too.
 
     The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]. In a batch the first
     axis is the scene. On a GPU, states and derivatives are not checked, to avoid copies to the host.
@@ -226,9 +228,8 @@ class NamedStates(HostStates):
         self._space, self._is_cpu = ParameterSpace(simulation, 0), bool(simulation.device.is_cpu)
         self._all_packed = dict[State, Packed]()
         self._last: tuple[dict[str, bytes], tuple[RestartState, ...]] | None = None
-        """On a CPU, the numbers of the last returned state, and its clocks and origins."""
+        """Bytes of the last returned state by array name, and the restart states of its scenes. Used on a CPU only."""
         self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
-        """Origins of the particles of valid states, by the checksum of the state."""
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -249,8 +250,8 @@ class NamedStates(HostStates):
         space.begin(rollout, values, varied, scenes, lambda first: self._copy_to(first, state))
 
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
-        """Return the state of a rollout after ``steps`` steps as named arrays. Lost scenes get NaN. On a GPU, the next
-        reading overwrites the arrays."""
+        """Return the state of a rollout after ``steps`` steps as named arrays. Arrays of lost scenes contain NaN. On a
+        GPU, the next call overwrites the returned arrays."""
         return self._returned(self.read(state, dict.fromkeys(rollout.lost, np.nan)), scenes_after(rollout, steps))
 
     def arrays(self, state: DeviceState) -> Named:
@@ -286,7 +287,6 @@ class NamedStates(HostStates):
         return found
 
     def _packed(self, state: State) -> Packed | None:
-        """Return the packed arrays of a state on a GPU, which its next reading or writing overwrites."""
         if self._is_cpu:
             return None
         return kept_or_made(self._all_packed, state, lambda own: Packed(own, self._simulation.dimension), 8)
@@ -331,7 +331,8 @@ class NamedStates(HostStates):
             self._last = None
 
     def _follows(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
-        """Return the scenes of the last returned state if the given state is the same, and otherwise nothing."""
+        """Return the scenes of the last returned state if ``given`` is the same state. Otherwise return an
+        empty tuple."""
         if self._last is None or not values.keys().isdisjoint(("time_step", "rest_density")):
             return ()
         numbers, scenes = self._last
@@ -345,7 +346,7 @@ class NamedStates(HostStates):
         return {name: np.asarray(given[name], dtype=real).tobytes() for name in self.shapes}
 
     def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
-        """Return restart states of all scenes with clocks and origins, but without fields."""
+        """Check a state, and return restart states of all scenes without fields."""
         if scenes := self._follows(given, values):
             self._simulation.judged_states.update(scenes)
             return scenes
@@ -393,12 +394,12 @@ class NamedStates(HostStates):
 
     @cached_property
     def _later(self) -> wp.array:
-        """Times of the last returned state. The next call waits for the device before it writes here."""
+        """Times of the last returned state. The next call waits for the device before it overwrites this array."""
         return wp.empty_like(self._pinned, pinned=True)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
-        """Return the clock of a state at a time [s], which may be rounded. If the time is a multiple of the time step
-        ``step``, the clock counts steps. Later times then have the same bits as in a single run."""
+        """Return the clock of a state at a rounded ``time`` [s]. If the time is a multiple of ``step``, the clock
+        counts time steps. Later times are then equal to the times of an uninterrupted run, bit for bit."""
         if self._simulation.scene.solver.chooses:
             return Clock(0, time, last)
         steps = round(time / step) if np.isfinite(time) and time >= 0.0 else 0

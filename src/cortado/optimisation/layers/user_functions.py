@@ -49,23 +49,24 @@ class Bridge(ABC):
 
     @abstractmethod
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Return a function that evaluates a loss for k weights and k initial positions, along a first axis. It returns
-        the losses (k,), and their gradients by name if ``slope`` is true."""
+        """Return a function that evaluates a loss for k weights and k initial positions, stacked along a first axis.
+        The function returns the losses (k,). If ``slope`` is true, the function also returns their gradients by name.
+        """
 
     @abstractmethod
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return the value of a function at ``weights`` as an array of JAX or PyTorch. In reverse mode the array has
-        the function's gradient."""
+        """Return the value of a function at ``weights`` as an array of JAX or PyTorch. In reverse mode, the derivative
+        of this array is the function's gradient."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
-        """Copy an array to the host in float64. Raises `InputError` for any other value."""
+        """Copy an array to the host in float64. Raises `InputError` if ``value`` is not an array of numbers."""
         return as_precise_numbers(what, value)
 
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Apply a step ``count`` times, each time with the next entry of each array in ``rows``. Return all states
-        along a first axis."""
+        """Apply a step ``count`` times. Step k uses element k of each array in ``rows``. Return the states after all
+        steps, stacked along a first axis."""
         states = [state]
         for k in range(count):
             states.append(step(states[-1], {name: row[k] for name, row in rows.items()}))
@@ -105,8 +106,8 @@ def state(
     """Return a state of a ``simulation`` as arrays: the initial state, or a ``given`` state, such as
     ``trajectory.last_state``.
 
-    ``parameters`` are values that affect the initial state, such as ``initial_velocities``. For a given state they are
-    the parameters of its run.
+    ``parameters`` are values that affect the initial state, such as ``initial_velocities``. For a ``given`` state,
+    ``parameters`` are the parameters of the run that produced the state.
 
     The result has positions [m] and velocities [m / s] (n, d), mass_fractions (n, phases), reference_density (n,), time
     () [s], and further fields of the solver. In a batch the first axis is the scene. Raises `InputError` for unsuitable
@@ -123,10 +124,11 @@ def state(
 def restart_state(
     bridge: Bridge, simulation: Simulation, given: Table, parameters: Values | None = None
 ) -> RestartState | tuple[RestartState, ...]:
-    """Convert a state of arrays to restart states for `Simulation.run`, files and other processes.
+    """Convert a state made of arrays to a restart state for `Simulation.run`, for files and for other processes. For a
+    batch, return a tuple with a restart state for each scene.
 
-    ``given`` is a state of ``simulation``. ``parameters`` are the parameters of the run so far, if they affect the
-    state.
+    ``given`` is a state of ``simulation``. If parameters of the run affect the state, ``parameters`` contains their
+    values.
 
     Example: ``run = simulation.run(100, state=restart_state(simulation, end))``
     """
@@ -149,21 +151,21 @@ def step(
     steps: int = 1,
     gradient: AdjointEstimator | None = None,
 ) -> dict[str, Any]:
-    """Return the state ``steps`` steps after the state ``given``, as a function of arrays. It corresponds to
+    """Take ``steps`` time steps from the state ``given`` and return the last state, as a function of arrays. See also
     `Simulation.step`.
 
     Args:
-        simulation: takes the steps.
+        simulation: the simulation that takes the steps.
         given: the state before the steps.
-        parameters: values for any parameters of `Problem` except initial values. Parameters over time have an entry for
-            each step.
+        parameters: values for any parameters of `Problem` except initial values. A parameter over time
+            has one value for each step.
         steps: number of steps.
         gradient: estimator for reverse mode, such as `gradients.AdjointViscosity`. The default is the exact adjoint.
             Forward mode is always exact.
 
-    Exact derivatives of chained steps are useful up to the horizon that `cortado gradients check` finds, some hundred
-    steps. A warning is given if adjoints grow by more than ten e-folds over a chain. Raises `InputError` for unsuitable
-    arguments, and `DivergedError` if a particle is lost.
+    Exact derivatives of chained steps are useful up to a horizon of some hundred steps. The command `cortado gradients
+    check` finds the horizon of a scene. A warning is given if adjoints grow by more than a factor of e^10 over a chain
+    of steps. Raises `InputError` for unsuitable arguments, and `DivergedError` if a particle is lost.
 
     Example: ``end = step(simulation, state(simulation), {"viscosity": 0.1}, steps=5)``
     """
@@ -211,11 +213,11 @@ def rollout(
 
 
 def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None = None) -> Callable[..., Any]:
-    """Return the loss of a ``problem`` as a function ``loss(parameters, state=None)`` of arrays by name. Its result has
+    """Return the loss of a ``problem`` as a function ``loss(parameters, state=None)`` of arrays by name. The loss has
     the shape (), or (batch,) for a batch.
 
     If ``state`` is given, the run begins with this state. Reverse mode uses the estimator ``gradient``, by default
-    `gradients.Exact`, and gives the same bits as `Problem.value_and_gradient`.
+    `gradients.Exact`. The gradient is equal to the gradient of `Problem.value_and_gradient`, bit for bit.
 
     Example::
 
@@ -231,11 +233,11 @@ def value(bridge: Bridge, problem: Problem, gradient: GradientEstimator | None =
 
 
 def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Callable[..., Any]:
-    """Return a function ``reading(state, parameters=None)`` of arrays. It reads ``what``: a sensor of
+    """Return a function ``reading(state, parameters=None)`` of arrays. The argument ``what`` is a sensor of
     `cortado.sensors`, or a quantity of the particles, such as "pressure".
 
     The reading of a sensor is an array (k,) with one number for each column. The reading of a quantity is (n,) or (n,
-    d). ``parameters`` are the parameters of the step after the state, which determines the pressure. Raises
+    d). ``parameters`` are the parameters of the next time step, because the pressure is computed in that step. Raises
     `InputError` if ``simulation`` is a batch.
 
     Example::
@@ -254,13 +256,13 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
 
 
 def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any = None, colours: Any = None) -> Any:
-    """Return a picture (rows, columns, 3) of particles in linear RGB, as a function of arrays. It corresponds to
+    """Return a picture (rows, columns, 3) of particles in linear RGB, as a function of arrays. See also
     `Renderer.render`.
 
     Args:
         renderer: from `Simulation.renderer`.
         positions: (n, d) [m].
-        fractions: mass fractions (n, phases), optional with one phase.
+        fractions: mass fractions (n, phases), which may be left out for a single phase.
         colours: (phases, 3), by default the colours of the renderer.
 
     Arrays are copied to the host, and derivatives exist in reverse mode only. Raises `InputError` for unsuitable
@@ -285,7 +287,7 @@ def _applied(bridge: Bridge, layer: Layer, given: Table | None, parameters: Tabl
 
 
 def table_of(what: str, given: Table | None) -> Table:
-    """Return a table, or an empty table for None. Raises `InputError` for any other value."""
+    """Return a dictionary unchanged, or an empty dictionary for None. Raises `InputError` for any other value."""
     found = {} if given is None else given
     likely = {"parameters": "{'gravity': array}", "weights": "{'bias': array}"}.get(what, "{'positions': array, ...}")
     require_table(what, found, likely)
@@ -322,8 +324,8 @@ class Loop:
         return self.simulation.room(1, 2**30 if estimator else 0.0)
 
     def together(self, points: Sequence[Values], estimator: AdjointEstimator | None = None) -> list[Estimate]:
-        """Estimate the losses and gradients of several loops in one mapped call. If a loss is infinite, the estimate
-        contains an error."""
+        """Estimate the losses and gradients of closed loops at several points in one batch. If a loss is infinite, its
+        estimate contains an error."""
         loops, gradient = LoopPass(self, points), dict[str, Any]()
         if estimator is not None:
             gradient = estimator.back(loops)
@@ -389,8 +391,8 @@ class Smoothed:
         self._bridge, self._estimator, self._loop = bridge, estimator, loop
 
     def __call__(self, weights: Mapping[str, Any]) -> Any:
-        """Return the mean of the loss over the ensemble. In reverse mode its derivative is the gradient of
-        `estimate`."""
+        """Return the mean of the loss over the ensemble. In reverse mode, the derivative of this mean is the smoothed
+        gradient, as in `estimate`."""
 
         def found(given: Mapping[str, Any]) -> tuple[float, Arrays]:
             own = self.estimate(given)
@@ -417,23 +419,24 @@ def smoothed(
     estimator: GradientEstimator,
     state: Mapping[str, Any] | None = None,
 ) -> Smoothed:
-    """Return the ``loss`` of a closed loop, smoothed over an ensemble, as a function of ``weights``, which are arrays
+    """Return the ``loss`` of a closed loop, smoothed over an ensemble, as a function of ``weights``. Weights are arrays
     by name.
 
     The value of the function is the mean of the loss over the ensemble, and its derivative is the smoothed gradient.
-    Its method ``estimate(weights)`` returns both as an `Estimate`, with the standard error.
+    The method ``estimate(weights)`` of the function returns an `Estimate` of the mean and of the gradient, with the
+    standard error.
 
     Args:
         simulation: simulation in which the loop runs.
-        loss: user-defined function ``loss(weights, state, gradient)``, which returns a number. It passes ``gradient``
-            on to `step` or `rollout`.
-        estimator: sets the spread of the weights, in their units, and the spread of initial positions.
+        loss: user-defined function ``loss(weights, state, gradient)``, which returns a number. The
+            function must pass ``gradient`` on to `step` or `rollout`.
+        estimator: gradient estimator, with the spread of the weights (in their units) and of the initial positions.
             `gradients.EnsembleMean` averages gradients, and `gradients.Guided` also corrects their size by differences
             of the loss.
         state: initial state of the loops, by default the initial state of the scene.
 
-    Loops run in batches by `jax.vmap`, compiled, or by `torch.vmap`. Raises `InputError` for unsuitable arguments, and
-    if called in a compiled program.
+    Loops run in batches, by `torch.vmap` or by compiled `jax.vmap`. Raises `InputError` for unsuitable arguments. Also
+    raises `InputError` if a compiled program calls the function.
 
     Example::
 

@@ -73,8 +73,9 @@ RESIDUALS = Residuals()
 
 
 def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
-    """Return the results of a layer, mapped over ``entries`` along a first axis. If ``keep`` is true, the residual is
-    stored, and the returned tickets (entries, 2) or (2,) identify it."""
+    """Return the results of a layer. Unless ``entries`` is None, the layer is mapped over a first axis of length
+    ``entries``. If ``keep`` is true, the residual is stored, and the returned tickets (entries, 2) or (2,) identify it.
+    """
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
     if not keep:

@@ -1,4 +1,4 @@
-"""The surroundings of the fluid as Warp functions: lit surfaces, sky with lamps, floor, and glass container.
+"""Warp functions for everything around the fluid: lit surfaces, sky with lamps, floor, and glass container.
 
 Coordinates are in picture axes with y upwards, and colours are linear.
 """
@@ -15,24 +15,24 @@ from cortado.pictures.tracing.near_particles import Floats, Ints, Vec2s, Vec3s, 
 class LitSurface:
     mesh: wp.uint64
     corners: Ints
-    """Indices of the points of all triangles (3 triangles,)."""
+    """Indices of the three vertices of each triangle, in one array (3 triangles,)."""
     normals: Vec3s
-    """Outward unit vectors (points,)."""
+    """Outward unit normals at the vertices (points,)."""
     colours: Vec3s
     light: Vec3s
-    """Light that falls on the surface (points,). A white surface in the light 1 has the brightness 1."""
+    """Light that falls on the surface at each vertex (points,). Light of 1 gives a white surface the brightness 1."""
     media: Vec2s
-    """Scattering and absorption (points,) [1/m]."""
+    """Scattering and absorption coefficients of the fluid at each vertex (points,) [1/m]."""
     is_flat: wp.int32
     reach: wp.float32
-    """Greatest extent of triangles of fluid behind a wall [m]."""
+    """Greatest distance [m] to which the fluid's surface extends behind a container wall."""
     left: Vec2s
-    """Transmitted fraction of light for each triangle of a transparent solid, from inside and from outside
-    (triangles,)."""
+    """Fractions of light (triangles,) that a transparent solid transmits at each triangle, for rays from inside and
+    from outside."""
     reflectivity: Floats
     """Mirror reflectivity of each triangle of an opaque solid (triangles,)."""
     from_edges: wp.array(dtype=wp.mat33)
-    """Distances of the corners (columns) of a triangle from up to three sharp edges (rows) [m]."""
+    """Distances [m] of a triangle's corners (columns) from its sides (rows). For smooth sides the distance is `FAR`."""
 
 
 @wp.func
@@ -46,7 +46,7 @@ def at_corners(surface: LitSurface, values: wp.array(dtype=Any), face: wp.int32,
 
 @wp.func
 def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
-    """Turn an interpolated normal against the direction of a ray."""
+    """Return an interpolated normal, turned so that it points against the direction ``d`` of a ray."""
     outside = face_normal
     n = normal
     if wp.dot(outside, d) > 0.0:
@@ -98,7 +98,7 @@ FAR = wp.constant(wp.float32(1.0e9))
 
 
 def shading_module(has_opaque: bool, has_clear: bool) -> Any:
-    """Return the Warp module of the shading kernels for a kind of scene."""
+    """Return the Warp module of the shading kernels for scenes with or without opaque and transparent solids."""
     return kernel_module("shading" + "_opaque" * has_opaque + "_clear" * has_clear)
 
 
@@ -110,15 +110,15 @@ class Solids:
     """Mesh of transparent solids and of tanks."""
     has_tank: wp.int32
     surfaces: wp.array(dtype=LitSurface)
-    """Surfaces of opaque and of transparent solids (2,)."""
+    """Two surfaces: the surface of all opaque solids, then the surface of all transparent solids."""
 
 
 @wp.struct
 class Environment:
     size: wp.float32
-    """Size of the contents [m]."""
+    """Greatest side of the box around the fluid and the container [m]."""
     nearest: wp.float32
-    """Least distance of a hit from the start of a ray [m]."""
+    """Smallest distance along a ray at which a hit counts [m]."""
     segments: wp.int32
     sun: wp.vec3
     fill: wp.vec3
@@ -147,10 +147,10 @@ class Environment:
     room_lower: wp.vec3
     """Lower corner of the shown region in container axes [m], -FAR if the region is infinite."""
     room_upper: wp.vec3
-    """Upper corner of the shown region in container axes [m]."""
+    """Upper corner [m] of the region in which fluid is shown, in container axes."""
     panes: wp.mat33
-    """Mask of the sides of the container that are panes of glass. Rows are lower and upper ends, and columns
-    are axes."""
+    """Mask of the container's sides that are panes of glass. The first row is for lower sides, the second row for upper
+    sides, and each column is for one axis."""
     edge_colour: wp.vec3
     has_walls: wp.int32
     """True for an opaque container."""
@@ -167,7 +167,7 @@ def smooth_step(lower: wp.float32, upper: wp.float32, x: wp.float32):
 
 @wp.func
 def schlick(normal_reflectance: wp.float32, cosine: wp.float32):
-    """Return Fresnel's reflectance by Schlick's approximation (1994)."""
+    """Return the Fresnel reflectance in the approximation of Schlick (1994)."""
     m = wp.clamp(1.0 - cosine, 0.0, 1.0)
     m2 = m * m
     return normal_reflectance + (1.0 - normal_reflectance) * m2 * m2 * m
@@ -180,7 +180,7 @@ def mirrored(direction: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def sky(s: Environment, d: wp.vec3):
-    """Return the light of the sky and its lamps from a direction."""
+    """Return the light that the sky and its lamps send along a ray with the direction ``d``."""
     base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
     strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
@@ -231,8 +231,8 @@ def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
 
 @wp.func
 def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-    """Return the light of a ray that meets neither fluid nor glass. ``spread`` is the width of a pixel at a distance of
-    1 m [m]."""
+    """Return the light along a ray that hits neither fluid nor glass. ``spread`` [m] is the width of a pixel at 1 m
+    from the camera."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]
         if t > 0.0:
@@ -243,8 +243,8 @@ def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spr
 
 @wp.func
 def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """Return the part of a ray between two planes perpendicular to an axis. ``o`` and ``d`` are the components of the
-    ray's origin and direction along this axis."""
+    """Shorten the interval ``span`` of a ray to the interval between two planes perpendicular to an axis. ``o`` and
+    ``d`` are the components of the ray's origin and direction along this axis."""
     if wp.abs(d) > 1.0e-9:
         t1 = (lower - o) / d
         t2 = (upper - o) / d
@@ -256,8 +256,8 @@ def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, 
 
 @wp.func
 def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """Return the part of a ray inside the upright cylinder in a box. If the ray misses the cylinder, the result is from
-    FAR to -FAR."""
+    """Return the interval of a ray inside an upright cylinder that fills the box from ``lower`` to ``upper``. If the
+    ray misses the cylinder, the interval is empty: (FAR, -FAR)."""
     radius = 0.5 * (upper[0] - lower[0])
     x = o[0] - 0.5 * (lower[0] + upper[0])
     z = o[2] - 0.5 * (lower[2] + upper[2])
@@ -275,8 +275,8 @@ def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the part of a ray inside the container. If the ray misses the container, the result is from FAR
-    to -FAR."""
+    """Return the interval of a ray inside the container. If the ray misses the container, the interval is empty: (FAR,
+    -FAR)."""
     p = s.glass_frame * o
     q = s.glass_frame * d
     span = wp.vec2(-FAR, FAR)
@@ -292,8 +292,8 @@ def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the part of a ray inside the shown region. If the ray misses the region, the result is from FAR
-    to -FAR."""
+    """Return the interval of a ray inside the region in which fluid is shown. If the ray misses the region, the
+    interval is empty: (FAR, -FAR)."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
     return within_walls(s, o, d)
@@ -336,7 +336,7 @@ MILKY = wp.constant(wp.float32(0.07))
 
 @wp.struct
 class Passed:
-    """Light from the glass along a ray, and the fraction of light that the glass transmits."""
+    """Light that glass adds to a ray, and the fraction of light that the glass transmits."""
 
     light: wp.vec3
     through: wp.float32
@@ -346,8 +346,8 @@ class Passed:
 def pane(
     s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
-    """Add a sheet of glass behind the sheets in ``behind``. ``rim`` is the visibility of the coloured edge, from 0 to
-    1."""
+    """Add one sheet of glass to a ray. ``behind`` holds the nearer sheets, and ``rim`` is the visibility of the
+    coloured edge, from 0 to 1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
     reflectance = is_pane * wp.min(1.4 * f / (1.0 + f), MILKY)

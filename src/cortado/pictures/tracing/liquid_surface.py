@@ -26,7 +26,7 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_of, smoothed, triangles_of
 
 NEIGHBOURS = 24
-"""Number of particles in the mean colour of a surface point."""
+"""Number of particles that are averaged for the colour of a surface point."""
 
 ROUND = 10_000
 """Greatest number of spheres drawn with 128 triangles each. More spheres are drawn with 32 triangles each."""
@@ -37,20 +37,20 @@ class Mesh:
     """A triangle mesh in 3-D. Seen from outside, the corners of a triangle run counterclockwise."""
 
     points: Points
-    """Points (p, 3) [m]."""
+    """Positions of the vertices (p, 3) [m]."""
     triangles: np.ndarray
-    """Indices of the points of each triangle (t, 3)."""
+    """Indices of the vertices of each triangle (t, 3)."""
     normals: Points
-    """Outward unit vectors (p, 3)."""
+    """Outward unit normals at the vertices (p, 3)."""
     colours: Points
-    """Linear colours (p, 3)."""
+    """Linear colours of the vertices (p, 3)."""
     velocities: Points | None = None
-    """Velocities (p, 3) [m/s], or None for solids and if velocities are unknown."""
+    """Velocities of the vertices (p, 3) [m/s], or None for solids and for unknown velocities."""
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:
-    """Return mean colours (p, 3) at points (p, d) [m] of the nearest particles, which have ``positions`` (n, d) [m] and
-    ``colours`` (n, 3)."""
+    """Return colours (p, 3) at points (p, d) [m], averaged over the nearest particles. The particles have ``positions``
+    (n, d) [m] and ``colours`` (n, 3)."""
     from scipy.spatial import cKDTree
 
     distances, which = cKDTree(positions).query(points, k=min(NEIGHBOURS, len(positions)), workers=usable_cores())
@@ -73,8 +73,8 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
 
 @cache
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
-    """Make the corners (k, 3) and triangles of a unit sphere from an octahedron whose triangles are cut ``levels``
-    times."""
+    """Return the vertices (k, 3) and triangles of a unit sphere. The sphere is made from an octahedron whose triangles
+    are divided ``levels`` times."""
     octants = np.array([np.diag(signs) for signs in product((1.0, -1.0), repeat=3)])
     triangles = np.array([one if np.linalg.det(one) > 0.0 else one[[0, 2, 1]] for one in octants]) + 0.0  # no -0
     for _ in range(levels):
@@ -87,22 +87,22 @@ def _sphere(levels: int) -> tuple[Points, np.ndarray]:
 
 
 REACH = 3.0
-"""Support radius of a particle in the density of the fluid [spacings]."""
+"""Support radius of the kernel for the fluid's density [spacings]."""
 REACH_OF_COLOURS = 2.25
-"""Support radius of a particle in colours [spacings]."""
+"""Support radius of the kernel for the fluid's colour [spacings]."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
-"""Pairs of the greatest number of particles and the width of the lattice cubes [spacings]."""
+"""Pairs of a greatest number of particles and the width of lattice cubes up to this number [spacings]."""
 WeightedLook = wp.types.vector(6, wp.float32)
 MOST_CELLS = 1 << 26
-"""Greatest number of cells in the search for particles."""
+"""Greatest number of cells in the grid that finds near particles."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
-"""Least visible scattering and absorption [1/m]."""
+"""Small value that is added to scattering and absorption before the logarithm [1/m]."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
 DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
-"""Factors of the volumes of isolated particles, and of particles in thin sheets."""
+"""Factors that reduce the volumes of isolated particles and of particles in thin sheets."""
 FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
-"""Filled fractions of space for isolated particles, thin sheets and bulk fluid."""
+"""Fraction of space that particles fill around isolated particles, in thin sheets, and in bulk fluid."""
 FULL = wp.constant(wp.float32(2.84))
 """Weighted number of neighbours above which a particle is not in a thin sheet."""
 
@@ -110,17 +110,17 @@ FULL = wp.constant(wp.float32(2.84))
 @dataclass(frozen=True)
 class LiquidSurface:
     points: wp.array
-    """Points (p,) as vec3 [m]."""
+    """Positions of the vertices (p,) as vec3 [m]."""
     triangles: wp.array
-    """Indices of the points of all triangles (3 t,)."""
+    """Indices of the three vertices of each triangle, in one array (3 t,)."""
     normals: wp.array
-    """Outward unit vectors (p,) as vec3."""
+    """Outward unit normals at the vertices (p,) as vec3."""
     colours: wp.array
-    """Linear colours (p,) as vec3."""
+    """Linear colours of the vertices (p,) as vec3."""
     media: wp.array
-    """Scattering and absorption (p,) as vec2 [1/m]."""
+    """Scattering and absorption coefficients at the vertices (p,) as vec2 [1/m]."""
     neighbours: wp.array
-    """Adjacent points of each point (p,), for `smoothed`."""
+    """Indices of the adjacent vertices of each vertex (p,), for `smoothed`."""
 
     def softened(self, light: wp.array, launch: BandLauncher) -> wp.array:
         everywhere = wp.ones(len(light), dtype=wp.float32, device=launch.device)
@@ -134,7 +134,7 @@ def crowd(s: NearParticles, j: wp.int32):
 
 @wp.func
 def tint(s: NearParticles, j: wp.int32):
-    """Return the colours of a particle, and the logarithms of its scattering and absorption."""
+    """Return the colour of a particle, and the logarithms of its scattering and absorption coefficients."""
     x = s.looks[j]
     return WeightedLook(x[0], x[1], x[2], wp.log(x[3] + CLEAREST), wp.log(x[4] + CLEAREST), 1.0)
 
@@ -144,8 +144,8 @@ crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_weights(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec3s, weights: Floats):
-    """Compute the smoothing weight of each point, which is small where there are few particles (Löschner et
-    al. 2023)."""
+    """Compute the smoothing weight of each surface point. The weight is small near few particles (Löschner et al.
+    2023)."""
     v = first + wp.tid()
     near = crowd_near(s, points[v], reach)
     x = wp.min(near[0] / wp.max(near[1], 1.0e-9) / FULL, 1.0)
@@ -189,8 +189,8 @@ Level = tuple[Any, wp.array]
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
-    """Return the density of the fluid on a lattice of cubes at least ``least`` spacings wide, and the
-    `NearParticles`."""
+    """Return the density of the fluid on a lattice of cubes, and the particles as `NearParticles`. The cubes are at
+    least ``least`` particle spacings wide."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
     s = near_particles(particles, ends, spacing, reach, launch)
@@ -205,8 +205,8 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, lea
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
-    """Make the surface of the fluid, which is a level set of its density. The smoothing preserves thin sheets (Löschner
-    et al. 2023). Raises `ComputationError` if there is no surface."""
+    """Make the surface of the fluid, an isosurface of its density. The smoothing preserves thin sheets (Löschner et al.
+    2023). Raises `ComputationError` if there is no surface."""
     device, reach = launch.device, REACH * spacing
     if level is None:
         level, s = liquid_level(particles, spacing, launch, least)

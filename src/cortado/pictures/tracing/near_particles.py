@@ -32,11 +32,12 @@ OPAQUE = (1e6, 0.0)
 """Scattering and absorption of opaque fluid [1/m]."""
 PARTS = 4096
 AT_ONCE = 8000
-"""Number of particles in a block of a matrix product. In larger products BLAS starts threads and is slower."""
+"""Number of particles in one matrix product. For larger products, BLAS starts threads and is slower."""
 
 
 def mixed(fractions: Points, values: Points) -> Points:
-    """Mix the values of phases (phases, c) by mass fractions (n, phases), and return values of particles (n, c)."""
+    """Return particle values (n, c), mixed from ``values`` of the phases (phases, c) by mass ``fractions`` (n,
+    phases)."""
     found, shares = np.empty((len(fractions), values.shape[1])), np.clip(fractions, 0.0, 1.0)
     for first in range(0, len(shares), AT_ONCE):
         np.matmul(shares[first : first + AT_ONCE], values, out=found[first : first + AT_ONCE])
@@ -46,14 +47,14 @@ def mixed(fractions: Points, values: Points) -> Points:
 @dataclass(frozen=True)
 class Particles:
     places: wp.array
-    """Positions (n,) as vec3 [m]."""
+    """Positions of the particles (n,) as vec3 [m]."""
     looks: wp.array
-    """Colours, scattering and absorption (n,) as `Look`."""
+    """Colour, scattering and absorption of each particle (n,) as `Look`."""
 
     @classmethod
     def on(cls, device: Any, places: Points, colours: Points, media: ArrayLike = OPAQUE) -> "Particles":
-        """Copy NumPy arrays (n, 3) to a device. ``media`` (n, 2) or (2,) has scattering and absorption [1/m]. Raises
-        `ComputationError` for positions that are not finite."""
+        """Copy positions (n, 3) [m] and colours (n, 3) from NumPy arrays to a device. ``media`` (n, 2) or (2,) are
+        scattering and absorption coefficients [1/m]. Raises `ComputationError` for positions that are not finite."""
         finite = np.isfinite(places)
         if not finite.all():
             astray = len(places) - int(finite.all(axis=1).sum())
@@ -69,7 +70,7 @@ class Particles:
         return len(self.places)
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
-        """Return the lower and the upper corner of the particles (3,) [m]."""
+        """Return the lower and the upper corner (3,) [m] of a box around the particles."""
         count, device = min(PARTS, len(self)), self.places.device
         lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
         launch(find_ends, count, places=self.places, lower=lower, upper=upper)
@@ -98,7 +99,7 @@ def list_marked(first: wp.int32, marks: Ints, counts: Ints, numbers: Ints):
 
 
 def marked(marks: wp.array, launch: BandLauncher) -> tuple[wp.array, wp.array]:
-    """Return the indices of all marks (n,) that are 1, and the cumulative sum of the marks (n,)."""
+    """Return the indices at which ``marks`` (n,) is 1, and the cumulative sum of ``marks`` (n,)."""
     counts = wp.empty_like(marks)
     wp.utils.array_scan(marks, counts)
     numbers = wp.empty(last_of(counts), dtype=wp.int32, device=marks.device)
@@ -113,22 +114,22 @@ def last_of(numbers: wp.array) -> int:
 @wp.struct
 class NearParticles:
     lower: wp.vec3
-    """Lower corner of the cells [m]."""
+    """Lower corner of the grid of cells [m]."""
     spacing: wp.float32
-    """Width of cells [m]."""
+    """Width of a cell [m]."""
     shape: wp.vec3i
     starts: Ints
     """Index of the first particle of each cell (cells + 1,)."""
     places: Vec3s
-    """Positions (n,) [m]."""
+    """Positions of the particles (n,) [m]."""
     looks: Looks
     volumes: Floats
-    """Volumes (n,), relative to an isolated particle."""
+    """Volumes of the particles (n,), relative to the volume of an isolated particle."""
 
 
 @wp.func
 def bump(q: wp.float32):
-    """Return the cubic spline of q, which is 1 at q = 0 and 0 from q = 1 on."""
+    """Return a cubic spline that falls from 1 at q = 0 to 0 at q = 1, and is 0 beyond."""
     if q < 0.5:
         return 1.0 - 6.0 * q * q * (1.0 - q)
     r = 1.0 - q
@@ -141,8 +142,8 @@ def bump_at(q: float) -> float:
 
 @cache
 def sum_near(term: Callable[..., Any], number: Any) -> Any:
-    """Make the Warp function ``(s, p, reach)`` that sums ``term(s, j)`` over the particles j within ``reach`` [m] of a
-    point p, weighted by `bump`. ``number`` is the Warp type of the term."""
+    """Make a Warp function with the arguments ``(s, p, reach)``. The function sums ``term(s, j)`` over the particles j
+    within ``reach`` [m] of the point p, with `bump` as the weight. ``number`` is the Warp type of ``term``."""
 
     @wp.func
     def summed(s: NearParticles, p: wp.vec3, reach: wp.float32):
@@ -194,7 +195,8 @@ def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: 
 def near_particles(
     given: Particles, ends: tuple[np.ndarray, np.ndarray], spacing: float, reach: float, launch: BandLauncher
 ) -> Any:
-    """Sort the particles between the corners ``ends`` (3,) [m] into cells, for sums within ``reach`` [m]."""
+    """Sort the particles in the box between the corners ``ends`` (3,) [m] into cells. Sums over the particles within
+    ``reach`` [m] of a point use these cells."""
     device, lower = launch.device, np.floor(ends[0] / spacing) * spacing
     x, y, z = (int(n) + 1 for n in np.floor((ends[1] - lower) / spacing))
     sorting = CellSort(Grid(lower, np.full(3, spacing), (x, y, z)), len(given), FLOAT32, device)

@@ -20,13 +20,13 @@ from cortado.pictures.tracing.liquid_surface import Mesh
 from cortado.pictures.tracing.near_particles import Floats, Looks, Particles, Vec3s, Vec3s2d, Vec4s2d
 
 NODES = 320
-"""Number of shadow nodes on the floor along each axis."""
+"""Number of floor nodes along each axis at which the shadow is computed."""
 ABOVE = 1e-3
-"""Height of solid surfaces that count as lying on the floor, relative to the size of the contents."""
+"""Greatest height of a solid's surface that lies on the floor, as a fraction of `Stage.size`."""
 REACH = 1.5
-"""Half the width of the floor with shadow nodes, relative to the size of the contents."""
+"""Half the width of the floor area with shadows, as a multiple of `Stage.size`."""
 KEY, AROUND = 0.022, 0.05
-"""Softness of the lamp's shadow and of the sky's shadow, relative to the size of the contents."""
+"""Widths of the blur of the lamp's shadow and of the sky's shadow, as fractions of `Stage.size`."""
 CLOSE = 0.15
 """Greatest height of objects that shade the floor from the sky, relative to the size of the contents."""
 SKY = 0.32
@@ -47,7 +47,8 @@ class DeviceSurface:
     def of(
         cls, points: wp.array, triangles: wp.array, normals: wp.array, colours: wp.array, softened: Soften | None = None
     ) -> "DeviceSurface":
-        """Make a surface from device arrays of triangles (3 t,) and points (p,) [m]."""
+        """Make a surface from device arrays: vertex positions ``points`` (p,) [m] and vertex indices ``triangles`` (3
+        t,)."""
         mesh, found = wp.Mesh(points, triangles), LitSurface()
         found.mesh, found.corners, found.normals, found.colours = mesh.id, triangles, normals, colours
         found.light, found.media = wp.zeros_like(points), wp.zeros(len(points), dtype=wp.vec2, device=points.device)
@@ -63,7 +64,7 @@ class DeviceSurface:
 FINE, FINE_OWN = 0.03, 0.05
 """Greatest width of the faces of round solids, relative to the contents and relative to the solid."""
 LONGEST = 0.04
-"""Greatest side of illuminated triangles, relative to the size of the contents."""
+"""Greatest side of a triangle at whose corners light is computed, as a fraction of `Stage.size`."""
 
 
 MODULE = kernel_module("shadow")
@@ -88,8 +89,8 @@ typed = TypesByName(
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def cast(places, looks, volumes, corner, cell, slope, fading, begin, thickness):
-    """Add the shadow of each particle to the nearest four floor nodes. The shadow fades with height by ``fading``
-    [1/m]."""
+    """Add the shadow of each particle to the four nearest floor nodes. ``fading`` [1/m] is the rate at which the shadow
+    fades with height."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
@@ -133,7 +134,7 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
-    """Darken floor nodes by the shadows of the lamp and of the sky."""
+    """Reduce the light at floor nodes by two shadows: from the light of the lamp and from the light of the sky."""
     n = first + wp.tid()
     i = n / key.shape[1]
     j = n % key.shape[1]
@@ -155,7 +156,7 @@ class FloorShadow:
         self.cell = 2.0 * REACH * stage.size / (NODES - 1)
         """Distance between nodes [m]."""
         self.light = wp.ones((NODES, NODES), dtype=wp.vec3, device=self._device)
-        """Fraction of light at the nodes along x and z (nodes, nodes)."""
+        """Fraction of light at each node (nodes, nodes), along x and z."""
 
     def of_fluid(self, particles: Particles) -> None:
         stage = self._stage
@@ -175,8 +176,8 @@ class FloorShadow:
         self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.transparency, 0.0)
 
     def _add(self, parts: Particles, volumes: list[wp.array], least: float, opacity: float, tinted: float) -> None:
-        """Add the shadow of particles with ``volumes`` (n,) [m3] for the lamp and for the sky. ``least`` is the least
-        softness [m]."""
+        """Add the shadows of particles from the lamp and from the sky. ``volumes`` are two arrays (n,) [m3], for lamp
+        and sky. ``least`` [m] is the smallest width of the blur."""
         if not len(parts):
             return
         stage = self._stage
@@ -206,7 +207,7 @@ class FloorShadow:
         return first.tolist(), (rows, columns)
 
     def _thickness(self, parts: Particles, volumes: wp.array, bell: Points, shape: tuple[int, int], **at: Any) -> Any:
-        """Return the blurred thickness of particles above the floor nodes."""
+        """Return the thickness of fluid or solid above each floor node, blurred."""
         sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
         given = {"places": parts.places, "looks": parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **at, thickness=sharp)
@@ -232,7 +233,7 @@ class SolidSurfaces:
 
     @property
     def kinds(self) -> tuple[bool, bool]:
-        """True if opaque solids exist, and true if transparent solids exist."""
+        """Two flags: whether there are opaque solids, and whether there are transparent solids."""
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 
@@ -242,8 +243,8 @@ class SolidSurfaces:
                 shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
-        """Return the struct `Solids` and the surfaces of ``solids`` at their present poses. Keep a reference to the
-        surfaces while the struct is used."""
+        """Return the Warp struct `Solids` and the device surfaces of ``solids`` at their present poses. Keep a
+        reference to the device surfaces while the struct is used."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         for k, is_clear in enumerate((False, True)):

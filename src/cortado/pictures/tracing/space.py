@@ -52,19 +52,20 @@ from cortado.scene.scene import Scene
 SKIN = 0.7
 """Approximate distance from a particle to the drawn surface [spacings]."""
 DEPTHS = (1.0, 0.7, 0.4, 0.1)
-"""Depths of a mirror image behind a surface, relative to the particle's distance from the surface. The first depth with
-a hidden image is used."""
+"""Possible depths of a mirror image behind a surface, relative to the particle's distance from the surface. The first
+depth that hides the image inside the solid is used."""
 ON_SURFACE = 0.05
-"""Tolerance for points on a surface [spacings]."""
+"""Greatest distance of a point from a surface at which it counts as on the surface [spacings]."""
 SAME_SIDE = 0.8
-"""Cosine of the angle between two normals on the same side of a solid."""
+"""Cosine of the angle between two normals of a solid. Above this cosine, the normals belong to the same side."""
 
 
 def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing: float) -> tuple[Points, np.ndarray]:
-    """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the index of the original point (m,).
+    """Return the mirror images (m, d) [m] of points (n, d) [m] behind solids. Also return the index of the original
+    point of each image (m,).
 
-    A point closer to a solid than ``near`` [m] has an image behind each touched side, and behind the corner between two
-    touched sides. Behind a thin solid the image is closer to the surface or left out.
+    A point touches a side of a solid at a distance below ``near`` [m]. The point has an image behind each touched side,
+    and behind the corner between touched sides. Behind a thin solid the image is closer to the surface or left out.
     """
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
@@ -99,7 +100,7 @@ def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) ->
 
 
 TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = wp.constant(wp.float32(0.8)), 1.1, wp.constant(wp.float32(1.5))
-"""Distances between particles and a touched flat wall, a touched solid, and a touched round wall [spacings]."""
+"""Greatest distances at which particles touch a flat wall, a solid, and a round wall [spacings]."""
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -111,8 +112,8 @@ def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
 def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
-    """Return particles in picture axes. ``positions`` (n, 3) [m] are in the axes of the scene. ``fractions`` (n,
-    phases) are mass fractions, by default equal for all phases."""
+    """Return particles in picture axes. ``positions`` (n, 3) [m] are in scene axes. ``fractions`` (n, phases) are mass
+    fractions, by default equal for all phases."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -122,8 +123,8 @@ def particles_of(
 
 @wp.func
 def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
-    """Return which mirror images a particle at ``q`` has along an axis: bit 1 for the lower wall, bit 2 for the upper
-    wall."""
+    """Return a bit mask of the mirror images of a particle at ``q`` along an axis. Bit 1 is for the lower wall and bit
+    2 for the upper wall."""
     found = wp.int32(0)
     if s.glass == wp.static(GLASS_BOX) or axis == 1:
         if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
@@ -140,7 +141,7 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """Return the vector from a particle at ``q`` to its mirror image along an axis."""
+    """Return the vector from a particle at ``q`` to one of its mirror images along an axis."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -178,7 +179,7 @@ def list_images(
     image_places: Vec3s,
     image_looks: wp.array(dtype=Look),
 ):
-    """List the positions and colours of particles and of their mirror images."""
+    """Store the positions and colours of particles and of their mirror images."""
     i = first + wp.tid()
     n = wp.int32(0)
     if i > 0:
@@ -198,7 +199,7 @@ def list_images(
 
 
 def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) -> Particles:
-    """Return particles together with their mirror images behind solids and walls."""
+    """Return the particles and their mirror images behind solids and walls."""
     if stage.solids:
         placed = particles.places.numpy().astype(np.float64)
         images, of = mirrored(placed, stage.solids, TOUCHING_SOLID * stage.spacing, stage.spacing)
@@ -219,7 +220,7 @@ def wetting(stage: Stage, s: Any, particles: Particles, launch: BandLauncher) ->
 
 
 def environment_of(stage: Stage) -> Any:
-    """Return the `Environment` of a stage without solids and shadows."""
+    """Return the `Environment` of a stage, without solids and without shadows."""
     picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
     horizon = np.asarray(light.background)
     s.size, s.nearest, s.segments = stage.size, 1e-4 * stage.size, effort_of(stage.picture).segments
@@ -251,15 +252,15 @@ def environment_of(stage: Stage) -> Any:
 
 class State(NamedTuple):
     positions: Points
-    """Positions of particles (n, d) [m], in the scene's axes."""
+    """Positions of particles (n, d) [m], in scene axes."""
     colours: Points
     """Colours of particles (n, 3), in linear RGB."""
     pose: Scene | None = None
     """Scene with the poses of the solids, or None if solids do not move."""
     view: View | None = None
-    """View of a moving camera; None for a camera at rest."""
+    """View of a moving camera, or None for a camera at rest."""
     fractions: Points | None = None
-    """Mass fractions (n, phases); None for a single phase."""
+    """Mass fractions (n, phases), or None for a single phase."""
 
 
 class SpacePainter:
@@ -271,7 +272,7 @@ class SpacePainter:
         self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
         shading = self._trace, self._illuminates
         self._kernels = *shading, find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
-        """Kernels that a picture needs, for compiling their modules in parallel."""
+        """Kernels of a picture, listed so that their modules compile in parallel."""
         self._effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
         self._lamps = self._rays_to_light(*(self._effort.lights if is_liquid else SPHERE_LIGHTS))
         self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
@@ -285,7 +286,8 @@ class SpacePainter:
             return self._rays(*self.scenery(State(*state)))
 
     def still(self, state: State) -> Any:
-        """Return the `Still` of a state, or None if the fluid is not drawn as a surface."""
+        """Return the drawn fluid of a state as a `Still`, for averages over frames. Return None if the fluid is not
+        drawn as a surface."""
         with WARP:
             compile_ahead(self, self.device)
             stage, s, particles, shadow = self._placed(state)
@@ -297,14 +299,14 @@ class SpacePainter:
             return still_of(level, near, shadow.light, self._launch)
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
-        """Draw a state as a frame of a film without flickering. See `steadied`."""
+        """Draw a state as a frame of a film, averaged with other frames against flickering. See `steadied`."""
         with WARP:
             steady = steadied(own, before, after, self.stage.spacing, self._launch)
             return self._rays(*self.scenery(state, steady))
 
     def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
-        """Return the stage of a state, its `Environment`, the fluid's surface and its shadow. ``steady`` is an optional
-        `Still` with an averaged surface and shadow."""
+        """Return the stage of a state, its `Environment`, the fluid's surface and the floor shadow. An optional `Still`
+        in ``steady`` provides an averaged surface and an averaged shadow."""
         stage, s, particles, shadow = self._placed(state)
         if steady is None:
             shadow.of_fluid(particles)

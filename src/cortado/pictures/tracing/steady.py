@@ -1,8 +1,9 @@
 """Averages the drawn surface over frames of a film, so that fluid at rest does not flicker.
 
-Particles of fluid at rest drift by fractions of a spacing, and the surface drifts with them. The lattice of the surface
-is divided into blocks. In each block, the change of the mean density measures how far the fluid moves between frames.
-Frames are averaged if the fluid moves less than a fraction of a spacing. Moving fluid and drops are drawn unchanged.
+Particles of fluid at rest drift by fractions of a spacing, and the surface drifts with the particles. The lattice of
+the surface is divided into blocks. In each block, the change of the mean density measures how far the fluid moves
+between frames. Frames are averaged if the fluid moves less than a fraction of a spacing. Moving fluid and drops are
+drawn unchanged.
 """
 
 from collections.abc import Sequence
@@ -26,10 +27,10 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 
 WINDOW, SHADOW_WINDOW = 30, 6
-"""Numbers of averaged frames before and after a frame, for the surface and for the shadow."""
+"""Numbers of frames in an average, before a frame and again after it: for the surface, and for the shadow."""
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
-"""Limits of the displacement [spacings], of the change of density and of the change of light. Below the first limit a
-frame has full weight, above the second limit the weight is 0."""
+"""Pairs of limits for the displacement [spacings], the change of density and the change of light. Below the first limit
+a frame has full weight. Above the second limit its weight is 0."""
 BODY_REACH, BODY = 6.0, (7.0, 12.0)
 """Distance for counting particles around a block [spacings], and the counts for a drop and for bulk fluid."""
 TOUCHING = wp.constant(27)
@@ -37,7 +38,7 @@ TOUCHING = wp.constant(27)
 
 @wp.struct
 class Still:
-    """The fluid in one frame of a film, for averages over frames."""
+    """The fluid in one frame of a film, prepared for averages over frames."""
 
     b: Blocks
     blocks: Ints
@@ -45,9 +46,9 @@ class Still:
     means: Floats
     """Mean density of the fluid in each block (blocks,)."""
     bodies: Floats
-    """Values from 0 for drops to 1 for bulk fluid (blocks,)."""
+    """Measure of each block's fluid, from 0 for drops to 1 for bulk fluid (blocks,)."""
     light: Vec3s2d
-    """Light on the floor behind the fluid (nodes, nodes)."""
+    """Light at each node of the floor (nodes, nodes)."""
 
 
 @wp.func
@@ -59,7 +60,7 @@ def share(way: wp.float32, limits: wp.vec2):
 
 @wp.func
 def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
-    """Return the weight of frame ``j``, which decreases with its distance in time."""
+    """Return the weight of frame ``j``, which decreases with the number of frames between it and the averaged frame."""
     away = wp.where(j < before, j, j - before) + 1
     return 1.0 - float(away) / float(window + 1)
 
@@ -96,7 +97,7 @@ def find_means(first, own, s, reach, means, bodies):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_ways(first, own, others, width, touching, indices, ways):
-    """Compute the displacement of the fluid between frames in each block [spacings]."""
+    """Compute how far the fluid in each block moved between two frames [spacings]."""
     n = first + wp.tid()
     at = block_at(own.b, own.blocks[n])
     for k in range(TOUCHING):
@@ -190,8 +191,8 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """Average the `Still` of a frame with the frames before and after it, which are given nearest first. All averaged
-    frames must have the same lattice. ``spacing`` is the particle spacing [m]."""
+    """Average the `Still` of a frame with the frames ``before`` and ``after`` it, each list sorted from the nearest
+    frame. All frames must have the same lattice. ``spacing`` is the particle spacing [m]."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

@@ -1,8 +1,8 @@
 """The isosurface of a density, as a net with one corner in each lattice cube that the surface crosses (Gibson 1998).
 
-The density, called level, is stored at the nodes of a fixed lattice. The lattice is divided into blocks of `WIDTH`
-cubes along each axis. Nodes are computed only in blocks that may contain the surface. The net has a quadrilateral for
-each cube edge that the surface crosses.
+The density is called level, and is stored at the nodes of a fixed lattice. The lattice is divided into blocks of
+`WIDTH` cubes along each axis. The level is computed only in blocks that may contain the surface. The net has a
+quadrilateral for each cube edge that the surface crosses.
 """
 
 from dataclasses import dataclass
@@ -29,28 +29,28 @@ WIDTH = wp.constant(4)
 """Number of cubes along each axis of a block."""
 CUBES = wp.constant(64)
 LEVEL = wp.constant(wp.float32(0.6))
-"""Level of the isosurface; the level inside fluid is about 1."""
+"""Density at the isosurface. The density inside fluid is about 1."""
 
 
 ROUNDS_OF_NORMALS = 15
 Neighbours = wp.types.vector(6, wp.int32)
-"""Indices of the net corners in the six adjacent cubes, or -1."""
+"""Indices of the net corners in the six adjacent cubes, or -1 for a cube without a net corner."""
 
 
 @wp.struct
 class Blocks:
-    """A lattice of cubes, divided into blocks."""
+    """The density of fluid on a lattice of cubes, which is divided into blocks."""
 
     lower: wp.vec3
     cube: wp.float32
     """Width of a cube [m]."""
     shape: wp.vec3i
     corners: wp.array3d(dtype=wp.float32)
-    """Level at the corners of the blocks, an array over three axes."""
+    """Density at the corners of all blocks, a 3-D array."""
     places: Ints
-    """Cumulative number of blocks that may contain the surface (blocks,)."""
+    """Cumulative count of the blocks that may contain the surface (blocks,)."""
     levels: Floats2d
-    """Level at the nodes of each block that may contain the surface (k, CUBES)."""
+    """Density at the nodes of the k blocks that may contain the surface (k, CUBES)."""
 
 
 @wp.func
@@ -67,7 +67,8 @@ def block_at(b: Blocks, number: wp.int32):
 
 @wp.func
 def index_of(b: Blocks, at: wp.vec3i):
-    """Return the index of a block in ``levels``, -1 for a block without levels, or -2 outside the lattice."""
+    """Return the index of a block in ``levels``. The index is -1 for a block that is not in ``levels``, and -2 outside
+    the lattice."""
     if wp.min(wp.min(at[0], at[1]), at[2]) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
         return -2
     block = number_of(b, at[0], at[1], at[2])
@@ -88,7 +89,7 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """Return the level at a node, or at the corner of the node's block if the level at the node was not computed."""
+    """Return the density at a node. If it was not computed, return the density at the corner of the node's block."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -112,7 +113,7 @@ def volume(s: NearParticles, j: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def mark_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
-    """Mark the block corners within reach of a particle."""
+    """Mark the corners of blocks within ``reach`` of a particle."""
     p = s.places[first + wp.tid()] - b.lower
     wide = b.cube * float(WIDTH)
     low = (p - wp.vec3(reach)) / wide
@@ -161,8 +162,9 @@ def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks,
 def level_blocks(
     s: Any, ends: tuple[np.ndarray, np.ndarray], cube: float, reach: float, launch: BandLauncher
 ) -> tuple[Any, wp.array]:
-    """Compute the level of particles ``s`` in the box between the corners ``ends``, each (3,) [m], extended by
-    ``reach`` [m]. Return the `Blocks` and the indices of the blocks that may contain the surface."""
+    """Compute the density of particles ``s`` in the box between the corners ``ends``, each (3,) [m]. The box is
+    extended by ``reach`` [m] on all sides. Return the `Blocks` and the indices of the blocks that may contain the
+    surface."""
     device, wide = launch.device, WIDTH * cube
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
     b, shape = Blocks(), (high - low).astype(int)
@@ -184,15 +186,15 @@ class Cubes:
     blocks: Ints
     """Indices of the blocks that may contain the surface."""
     corners: Ints
-    """Cumulative number of net corners, (cubes + 1,)."""
+    """Number of net corners before each cube (cubes + 1,)."""
     sides: Ints
-    """Cumulative number of quadrilaterals, (cubes + 1,)."""
+    """Number of quadrilaterals before each cube (cubes + 1,)."""
 
 
 @wp.func
 def signs_of(b: Blocks, node: wp.vec3i):
-    """Return a bit mask of the cube's nodes inside the fluid. The node at offset (x, y, z) has the bit x + 2 y
-    + 4 z."""
+    """Return a bit mask of the eight nodes of a cube that are inside the fluid. The node at the offset (x, y, z), each
+    0 or 1, has the bit number x + 2 y + 4 z."""
     signs = wp.int32(0)
     for n in range(8):
         if level_at(b, node + wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)) > LEVEL:
@@ -320,7 +322,7 @@ def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Flo
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_normals(first: wp.int32, signs: Ints, neighbours: wp.array(dtype=Neighbours), points: Vec3s, normals: Vec3s):
-    """Compute the area-weighted mean normal of the quadrilaterals around each corner."""
+    """Compute the normal at each net corner as the mean over its quadrilaterals, weighted by area."""
     v = first + wp.tid()
     beside = neighbours[v]
     total = wp.vec3(0.0)
@@ -356,14 +358,14 @@ class SurfaceNet:
     cubes: Any
     cube_signs: wp.array
     points: wp.array
-    """Positions of corners (corners,) [m]."""
+    """Positions of the net corners (corners,) [m]."""
     signs: wp.array
     neighbours: wp.array
     sides: int
 
 
 def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
-    """Make the surface net of a level. ``blocks`` are the indices of the blocks that may contain the surface."""
+    """Make the net of an isosurface. ``blocks`` are the indices of the blocks that may contain the surface."""
     device, count, cubes = launch.device, len(blocks) * CUBES, Cubes()
     signs = wp.empty(count, dtype=wp.int32, device=device)
     cubes.b, cubes.blocks = b, blocks
@@ -378,14 +380,14 @@ def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
 
 
 def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
-    """Smooth vectors (p,) over their neighbours in several ``rounds``. Each round moves a vector towards the mean of
-    its neighbours by the fraction ``weights`` (p,)."""
+    """Smooth vectors (p,) at net corners in several ``rounds``. Each round moves a vector towards the mean of its
+    neighbours, by the fraction in ``weights`` (p,)."""
     own = {"neighbours": neighbours, "weights": weights}
     return launch.to_and_fro(smooth, rounds, wp.clone(values), wp.empty_like(values), **own)
 
 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return the outward unit normals (p,) of a net with corners at ``points`` (p,)."""
+    """Return outward unit normals (p,) at the net corners, which have the positions ``points`` (p,)."""
     normals, other = wp.empty_like(points), wp.empty_like(points)
     own = {"signs": net.signs, "neighbours": net.neighbours}
     launch(find_normals, len(points), **own, points=points, normals=normals)
@@ -393,7 +395,8 @@ def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.ar
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return the triangles of a net with corners at ``points`` (p,), as corner indices (3 t,)."""
+    """Return the triangles of a net as indices of its corners (3 t,). The net corners have the positions ``points``
+    (p,)."""
     found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
     given = {"cubes": net.cubes, "signs": net.cube_signs, "points": points}
     launch(list_triangles, len(net.cube_signs), **given, triangles=found)

@@ -4,9 +4,9 @@ First, `illuminate_kernel` computes the light on surfaces. Then rays are traced 
 split by Fresnel's law. The reflected ray continues to the surroundings or to the fluid. The refracted ray passes
 through the fluid and leaves it again, up to ``segments`` times.
 
-Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light is replaced by the fluid's colour in
-the light on its surface. The remaining light is multiplied by colour^(absorption L), by the Beer-Lambert law. The
-optical properties of the entry point are used along the whole ray.
+Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light is scattered light. Scattered light has
+the fluid's colour and the brightness of the light on the fluid's surface. The remaining light is multiplied by
+colour^(absorption L), by the Beer-Lambert law. The optical properties at the entry point are used along the whole ray.
 """
 
 from functools import cache
@@ -36,14 +36,14 @@ from cortado.scene.appearance import Picture
 
 class Effort(NamedTuple):
     cube: float
-    """Smallest width of the cubes of the surface lattice [spacings]."""
+    """Smallest width of a lattice cube for the fluid's surface [spacings]."""
     segments: int
     contrast: float
-    """Contrast with neighbouring pixels in linear light, above which a pixel gets additional rays."""
+    """Contrast in linear light between adjacent pixels. Above this contrast, a pixel gets additional rays."""
     again: int
     """Number of additional rays of a pixel."""
     lights: tuple[int, int]
-    """Numbers of light rays at a surface point, from all directions and from the lamp."""
+    """Numbers of rays that measure the light at a surface point: rays in all directions, and rays towards the lamp."""
 
 
 EFFORTS = {"traced": Effort(0.0, 4, 0.045, 4, (20, 4)), "quick": Effort(0.5, 1, 0.045, 2, (8, 2))}
@@ -61,10 +61,11 @@ BOUNCED = wp.constant(wp.float32(0.45))
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """Return the part of ``light`` from direction ``d`` that reaches the point ``p`` past solids within ``reach`` [m].
+    """Return the light that reaches the point ``p`` from the direction ``d``, reduced by solids within ``reach`` [m].
+    Without solids, the result is ``light``.
 
-    A near solid blocks more light than a distant solid, and adds a little light of its colour. A point inside a solid
-    gets all light.
+    A near solid blocks more light than a distant solid, and adds a little light of its colour. For a point inside a
+    solid, no light is blocked.
     """
     hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
@@ -136,15 +137,15 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 INDEX = wp.constant(wp.float32(1.33))
 FAINT = wp.constant(wp.float32(0.05))
-"""Reflectance below which a ray at the surface is not split."""
+"""Greatest reflectance of the fluid's surface at which a ray is not split."""
 DARK = wp.constant(wp.float32(10.0))
 """Number of mean free paths in fluid after which light is neglected."""
 
 
 @wp.struct
 class Eye:
-    """A camera. The ray of a pixel at screen coordinates a and b from -1 to 1 has the direction ``forward + a right + b
-    up``."""
+    """A camera. A pixel has screen coordinates a and b from -1 to 1, and its ray has the direction ``forward + a right
+    + b up``."""
 
     position: wp.vec3
     forward: wp.vec3
@@ -292,7 +293,8 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def trace(first, eye: Eye, s, surface, shadow, pixels, offsets, image):
-        """Compute the light of pixels, as the mean over rays at ``offsets`` [pixels]."""
+        """Compute the light of pixels, each the mean over rays. ``offsets`` are the distances of the rays from the
+        pixel's middle [pixels]."""
         pixel = pixels[first + wp.tid()]
         spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
         light = wp.vec3(0.0)
@@ -313,7 +315,7 @@ TILE = 8, 4
 
 
 def in_tiles(columns: int, rows: int) -> np.ndarray:
-    """Return the indices of the white pixels of a chequerboard, ordered in small tiles."""
+    """Return the indices of the pixels on the white squares of a chequerboard, ordered in small tiles."""
     wide, high = TILE
     row, column = np.divmod(np.arange(columns * rows), columns)
     tile = (row // high) * -(-columns // wide) + column // wide
@@ -323,8 +325,8 @@ def in_tiles(columns: int, rows: int) -> np.ndarray:
 
 @wp.kernel(module=kernel_module("contrast"), enable_backward=False)
 def find_contrast(first: wp.int32, columns: wp.int32, image: Vec3s, contrast: wp.float32, found: Ints):
-    """Fill every second pixel of a chequerboard image with the mean of its neighbours. Set ``found`` to 1 at pixels
-    that differ from neighbouring pixels by more than ``contrast``."""
+    """Fill the missing half of a chequerboard image: each missing pixel is the mean of its neighbours. Set ``found`` to
+    1 at pixels that differ from neighbouring pixels by more than ``contrast``."""
     i = first + wp.tid()
     column = i % columns
     row = i / columns

@@ -1,26 +1,26 @@
 """Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009): steps, their tangent and adjoint, and two
 factors on the pressure correction delta of an iteration.
 
-*Density ratios*: delta is derived for particles of equal mass, but a pressure moves lighter neighbours further, by
-the ratio of the masses. The iteration diverges if a density changes by more than twice the wanted amount. delta is
-therefore multiplied by the density-ratio relaxation
+*Density ratios*: The formula for delta assumes particles of equal mass. A pressure moves lighter neighbours further, in
+proportion to the ratio of the masses. The iteration diverges if a density changes by more than twice the wanted amount.
+delta is therefore multiplied by the density-ratio relaxation
 
-    1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0,
+    1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0.
 
-which is 1 among particles of equal or greater mass. For large t it tends to 1 / (1 + t / 2), the value for a lattice.
-The constant a makes e smooth at t = 0.
+The relaxation of a particle is 1 among particles of equal or greater mass. For large t the relaxation tends to 1 / (1 +
+t / 2), the value for a lattice. The constant a makes e smooth at t = 0.
 
-*Walls*: delta is derived for a particle with a filled neighbourhood. Beside a wall the same pressure changes the
-density of the particle more, by |S_i|^2 / (2 sum_j G_j . G_j) with the sum S_i = sum_b w_b G_ib over wall particles
-b and the kernel gradients G_j on a lattice. Above 2 the iteration overshoots and pushes the particle away. A
-particle that approaches a wall meets a steeper gradient than at the start of the step, so the response is doubled.
-delta is multiplied by the wall relaxation
+*Walls*: The formula for delta assumes a particle with a filled neighbourhood. Beside a wall, the same pressure changes
+the density of particle i more, by |S_i|^2 / (2 sum_j G_j . G_j). Here S_i = sum_b w_b G_ib is a sum over wall particles
+b, and G_j are the kernel gradients on a lattice. A change of more than twice the wanted amount overshoots and pushes
+the particle away. A particle that approaches a wall meets a steeper gradient than at the start of the step.
+The change by walls is therefore doubled. delta is multiplied by the wall relaxation
 
-    y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j,
+    y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j.
 
-which is smooth, and 1 away from walls. The relaxation changes the rate of convergence, not the limit. Sums are
-multiplied by response^(-1/2) before they are squared, because the square of a gradient overflows in float32 for small
-spacings.
+The wall relaxation is smooth, and 1 away from walls. The relaxation changes the rate of convergence, not the limit.
+Sums are multiplied by response^(-1/2) before they are squared, because the square of a gradient overflows in float32
+for small spacings.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ from cortado.sph.density import density_solid_kernel, wall_slope_sums, wall_slop
 from cortado.sph.parts import StepContext
 
 SOFTNESS = 0.2
-"""Width of the smooth corner in the relaxation for lighter neighbours [-]."""
+"""Constant a of the density-ratio relaxation, which makes the relaxation smooth for equal masses [-]."""
 
 
 @cache

@@ -1,18 +1,25 @@
 """A rigid body in the projection: pressures change the body's velocities as they change velocities of fluid.
 
-Walls of a body push particle i by gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)), N_b = n_b n_b^T, summed over
-its own wall particles, with e_i computed from all walls (`cortado.solvers.projection.wall_sums`). With r_i = x_i - c',
-the pressure impulses y, the body's density rho and its volume K in units of a particle's volume,
+The walls of a body push particle i in proportion to the vector
+
+    gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)),   N_b = n_b n_b^T.
+
+The sum is over the wall particles b of the body. Wall particle b has the weight w_b, the normal n_b and the kernel
+gradient g_ib. The factor e_i is computed from all walls (`cortado.solvers.projection.wall_sums`). Pressure impulses y
+give the body the velocity V, the angular momentum L and the angular velocity W:
 
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
 
-is the transpose of the body's term in the divergence, - gamma_i . (V + W x r_i). The part of this term by the wall
-velocity (V_0, W_0) is contained in the sum over all walls. For a held body smaller matrices replace 1 / (rho K) and R'
-I^-1 R'^T (`cortado.sph.moving_solids`).
+Here r_i = x_i - c' is the arm of particle i, rho the density of the body, and K its volume in units of a particle's
+volume. This map is the transpose of the body's term in the divergence, - gamma_i . (V + W x r_i). The sum over all
+walls already contains the part of this term from the wall velocity (V_0, W_0). For a body with restricted motion,
+smaller matrices replace 1 / (rho K) and R' I^-1 R'^T (`cortado.sph.moving_solids`).
 
-The diagonal a_i of the iteration gets the term |gamma_i| sum_j |gamma_j| / (rho K) + lambda |r_i x gamma_i| sum_j |r_j
-x gamma_j| / rho, with lambda the largest eigenvalue of I^-1, because all particles around a light body move it. With
-this diagonal the body's part of the matrix has no eigenvalue above 2.
+All particles around a light body move the body. The diagonal a_i of the iteration therefore gets the term
+
+    |gamma_i| sum_j |gamma_j| / (rho K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho
+
+with the largest eigenvalue lambda of I^-1. With this diagonal the body's part of the matrix has no eigenvalue above 2.
 """
 
 from copy import copy
@@ -41,8 +48,9 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
     """Make the kernels of the push of particles on rigid bodies.
 
-    ``hold`` computes the push of a unit pressure and its arm. ``measure`` and ``weigh`` compute the body's term in the
-    diagonal of the pressure iteration. ``pull`` computes each particle's momentum on the body.
+    ``hold`` computes the push of each particle at unit pressure, and the arm of the push. ``measure`` and ``weigh``
+    compute the body's term in the diagonal of the pressure iteration. ``pull`` computes the momentum that each particle
+    gives to the body.
     """
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, pair = precision.pair, pair_functions(discretisation)
@@ -168,12 +176,12 @@ class Held:
         self.whole = {f"whole{self._suffix}": self._whole(self.known[f"sizes{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """Return the momentum and angular momentum by pressures (members,)."""
+        """Return the momentum and angular momentum that pressures give to the body (members,)."""
         found = (total(share) for total, share in zip(self._sums, self.shares.values(), strict=True))
         return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
 
     def pushes(self) -> Arrays:
-        """Return the momentum and angular momentum by pressures, contacts, springs and friction."""
+        """Return the momentum and angular momentum that pressures, contacts, springs and friction give to the body."""
         found = self.sums()
         for given, total in zip(self.given.values(), found.values(), strict=False):
             add(given, total)
@@ -217,8 +225,8 @@ class Bodies:
                 copy_each(held.sums(), held.body.pressed)
 
     def loosen(self, context: StepContext, y: wp.array) -> list[Arrays]:
-        """Write the velocities of bodies under pressures ``y`` without the effect of hinges. Return the momenta by
-        pressures."""
+        """Write the velocities of bodies under pressures ``y`` without the effect of hinges. Return the momenta that
+        the pressures give to the bodies."""
         found = []
         for held in self.held:
             known = self.known(context, held)

@@ -2,8 +2,8 @@
 
 A pressure iteration spreads a pressure by one or two spacings only. The coarse correction before an iteration removes
 the smooth part of the error, on a grid with nodes two spacings apart. The first iteration starts from the pressure of
-the last step, and has a coarse correction only without an earlier pressure. `docs/projection_step.md` has the
-equations. Takahashi and Lin (2016) have a multilevel particle solver.
+the last step. A coarse correction precedes the first iteration only if there is no earlier pressure.
+`docs/projection_step.md` has the equations. Takahashi and Lin (2016) describe a multilevel solver for particles.
 """
 
 from collections.abc import Callable
@@ -60,7 +60,6 @@ class Coarse:
         rows = 0 if self.bodies is None else self.bodies.rows
         self._levels = Levels(layout, dimension, grid.shape, rows)
         self._parts = wp.zeros((2**dimension, len(self._levels.r)), dtype=real, device=device)
-        """Terms of the right-hand side by cell (corners, cells)."""
         energy = 8.0 / 3.0 * (SPACING / spacing**2 if dimension == 3 else spacing**-2)  # of the gradient of a hat
         touched = (2.0 * SPACING) ** dimension
         self.grid = {"grid": self._sort.grid, "order": self._sort.order, "eps": LEAST * energy / touched}
@@ -68,7 +67,7 @@ class Coarse:
         """Force of a coarse pressure on sorted particles (`cortado.solvers.projection.coarse_push`)."""
         self.sums, self.parts = layout.sum_of(precision.pair), layout.arrays(parts=precision.pair)
         self.warm, self._none_stays = (wp.zeros(layout.members, dtype=wp.int32, device=device) for _ in range(2))
-        """``warm`` is 1 for each scene that starts with a pressure."""
+        """``warm`` is 1 for each scene in which the step starts from an earlier pressure."""
         self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
         """Zeros as initial values of the coarse pressure."""
@@ -118,8 +117,8 @@ class Coarse:
         self._levels.solve(e, self._tolerance, MOST)
 
     def correct(self, context: StepContext, k: int, known: Named, at: Named, new: Named) -> None:
-        """Correct the pressure before iteration ``k``. ``at`` are the arrays before and ``new`` after the
-        correction."""
+        """Correct the pressure before iteration ``k``. ``at`` contains the arrays before the correction, and ``new``
+        the arrays after the correction."""
         context.launch(self.residual.forward, at, new, self.source, known)
         self.solve(context, self._none, new["e"])
         context.launch(self.pressure.correct, at, new, self.grid, known)
@@ -192,8 +191,8 @@ class CoarseAdjoint:
             array.zero_()
 
     def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
-        """Apply the adjoint of the coarse correction before iteration ``k``. ``at`` are the adjoints before and ``new``
-        after the correction."""
+        """Apply the adjoint of the coarse correction before iteration ``k``. ``at`` contains the adjoints before the
+        correction, and ``new`` the adjoints after the correction."""
         own, found, known = self._coarse, self._steps, self._known
         context.launch(own.length.apply.adjoint, at, new, found, *known)
         known[0]["k_bar"].zero_()

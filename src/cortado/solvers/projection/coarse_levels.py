@@ -1,13 +1,15 @@
-"""A multigrid method, with which solves on the coarse grid of the pressure take few iterations.
+"""A multigrid method for the coarse grid of the pressure. With this method, solves take few iterations.
 
-Each level has half of the nodes of the finer level along every axis with an even number of nodes. Its matrix is R A R^T
-(Galerkin), with the matrix A of the finer level and bilinear R. Like A, it is a sum over cells. The solve
-(`cortado.solvers.projection.coarse_solve`) smooths by Jacobi steps x + w (r - A x), with the weight of node I
+A level has half of the nodes of the finer level along every axis with an even number of nodes. The matrix of a level is
+R A R^T (Galerkin), where A is the matrix of the finer level and R is bilinear. Like A, the matrix R A R^T is a sum over
+cells. The solve (`cortado.solvers.projection.coarse_solve`) smooths a solution x by Jacobi steps x + w (r - A x). Here
+r is the right-hand side, and w contains the weight of each node I:
 
     w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)).
 
-With the factor W below 2 Jacobi's method converges for every symmetric positive semidefinite matrix. With W = 1, w A
-has no eigenvalue above 1 (Baker, Falgout, Kolev and Yang 2011, applied to the matrix whose diagonal is scaled to 1).
+If the factor W is below 2, Jacobi's method converges for every symmetric positive semidefinite matrix. With W = 1, w A
+has no eigenvalue above 1. This bound is from Baker, Falgout, Kolev and Yang (2011), applied to the matrix with its
+diagonal scaled to 1.
 """
 
 from functools import cache
@@ -27,7 +29,7 @@ from cortado.solvers.projection.coarse_solve import BLOCK, solve_kernel, system_
 from cortado.sph.parts import StepContext
 
 FEWEST = 4
-"""Smallest number of nodes along an axis of a coarser grid."""
+"""Smallest even number of nodes along an axis that a coarser level halves."""
 W = wp.constant(1.9)
 
 
@@ -142,16 +144,16 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 def pairs_of_corners(dimension: int) -> int:
-    """Return the number of pairs of corners of a cell. A corner also forms a pair with itself."""
+    """Return the number of pairs of corners of a cell. The pairs of a corner with itself count as well."""
     return 2**dimension * (2**dimension + 1) // 2
 
 
 class Level(NamedTuple):
     shape: wp.vec3i
     factor: wp.vec3i
-    """Ratio of the finer level's number of nodes to this level's, along each axis."""
+    """Number of nodes of the finer level divided by the number of nodes of this level, along each axis."""
     cells: wp.array
-    """Terms of all cells in the matrix (pairs of corners, cells)."""
+    """Contribution of each cell to the matrix (pairs of corners, cells)."""
 
 
 class Levels:
@@ -178,8 +180,8 @@ class Levels:
             for n, factor, i, j in zip(shapes, factors, at[:-1], at[1:], strict=True)
         ]
         self.cells, self.r = self.levels[0].cells, residual[: counts[0]]
-        """Terms of the finest level's cells in the matrix (pairs of corners, cells), and the right-hand side
-        (nodes,)."""
+        """Contribution of each cell of the finest level to the matrix (pairs of corners, cells), and the right-hand
+        side (nodes,)."""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
         """Matrix of free bodies (rows, nodes)."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)

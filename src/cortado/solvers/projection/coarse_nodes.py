@@ -62,8 +62,9 @@ def node_functions(dimension: int) -> SimpleNamespace:
 
 @cache
 def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make Warp functions of the hat functions. ``at`` interpolates node values at a particle. ``products`` sums
-    products over the nodes around a particle. ``bend`` multiplies mixed second derivatives by a vector."""
+    """Make Warp functions that evaluate hat functions. ``at`` interpolates node values at a particle. ``products`` sums
+    the products of two node arrays over the nodes around a particle. ``bend`` multiplies mixed second derivatives by a
+    vector."""
     real, vector = precision.real, precision.vector
     grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
     number_of, corner_step = node_functions(dimension).number_of, node_functions(dimension).corner_step

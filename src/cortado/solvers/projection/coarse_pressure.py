@@ -1,6 +1,7 @@
 """A pressure on a coarse grid of hat functions phi_I, one at each node of a `CellSort`'s grid.
 
-With the share c of each particle, and N and h of `cortado.solvers.projection.coarse_push`,
+The equations use the share c of each particle (`cortado.solvers.projection.effects`), and N and h of
+`cortado.solvers.projection.coarse_push`:
 
     q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
     A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m_i    over the particles of the cells around I and J,
@@ -9,27 +10,32 @@ With the share c of each particle, and N and h of `cortado.solvers.projection.co
     y' = y + alpha d,   u' = u - alpha D^T d / m,
     alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
 
-S is a smoothstep from -1e-6 to 1e-6 of dt (D u - b): 1 for compression, 0 for tension. Without l, alpha minimises the
-kinetic energy along d, so that a correction never adds energy. Where the correction is nearly 0, as in free fall, l
-makes alpha 1. Before the first iteration l is only in the second sum, so that alpha is 0 in free fall.
+S is a smoothstep of dt (D u - b) from -1e-6 to 1e-6. S is 1 for compression and 0 for tension. Without the term l, the
+step length alpha minimises the kinetic energy along d, so that a correction never adds energy. Where the correction is
+nearly 0, as in free fall, l makes alpha 1. Before the first iteration l is only in the second sum of alpha, so that
+alpha is 0 in free fall.
 
-eps makes e small at nodes with few particles. So does h^2 / 100, which is nearly 0 in fluid and beside walls that
-enclose it, and which shortens solves where a particle has a wall beside it and no fluid. Two operations transfer values
-between nodes and particles: `spread` sums phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i over the particles
-of the cells around a node, in their order, and `at` gives E = sum_I phi_I e_I, its gradient G and its mixed second
-derivatives at a particle. With w = (N G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) /
-m.
+The constant eps makes e small at nodes with few particles. The term h^2 / 100 has the same effect. In fluid and beside
+walls that enclose the fluid, h^2 / 100 is nearly 0. Where a particle has a wall beside it and no fluid, h^2 / 100
+shortens solves.
+
+Two operations transfer values between nodes and particles. The operation `spread` sums phi_I s_i + grad phi_I . t_i +
+hess phi_I : R_i + e_I o_i at a node I. The sum is over the particles i of the cells around the node, in their order.
+The operation `at` gives E = sum_I phi_I e_I at a particle, its gradient G and its mixed second derivatives. With w = (N
+G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
 
 Free bodies are included on the grid so that a light body gives way from the first step on. Pressure impulses y give a
-body the momenta F = sum_i y_i gamma_i and T = sum_i y_i r_i x gamma_i (`cortado.solvers.projection.bodies`). The
-body gets V = F / (rho K) and W = R' I^-1 R'^T T / rho, which reduce the divergence of particle i by (G y)_i = gamma_i .
-(V + W x r_i). G is symmetric and positive semidefinite: y . G y is twice the kinetic energy that y gives to bodies at
-rest. On the grid G adds
+body the momentum F = sum_i y_i gamma_i and the angular momentum T = sum_i y_i r_i x gamma_i
+(`cortado.solvers.projection.bodies`). The body gets the velocity V = F / (rho K) and the angular velocity W = R' I^-1
+R'^T T / rho. This motion reduces the divergence of particle i by (G y)_i = gamma_i . (V + W x r_i). The matrix G is
+symmetric and positive semidefinite: y . G y is twice the kinetic energy that y gives to bodies at rest. On the grid G
+adds the matrix
 
     B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
 
-with F_I and T_I of y = phi_I c, to the matrix A: three rows for a body in the plane and six in space. For a held body
-the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and I^-1.
+to the matrix A. F_I and T_I are the momenta for the pressure impulses y = phi_I c. For each body, B has three rows in
+2-D and six rows in 3-D. For a body with restricted motion, the smaller matrices of `cortado.sph.moving_solids` replace
+1 / (rho K) and I^-1.
 """
 
 from functools import cache
@@ -149,15 +155,15 @@ SMALL = 1e-6
 
 @cache
 def length_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of the step length. ``share`` computes each particle's terms of two sums. ``apply`` computes the
-    new pressures and velocities."""
+    """Make the kernels of the step length. ``share`` computes the terms of each particle in two sums. ``apply``
+    computes the new pressures and velocities."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     small, typed = wp.constant(real(SMALL)), types_by_name(precision, {int: "first stays"})
     modules = [kernel_module(f"coarse_length_{precision.name}")] * 3
 
     @wp.func
     def length(sums: pair_of) -> real:
-        """Return the step length from two sums. NaN stays NaN."""
+        """Return the step length from two sums. If a sum is NaN, the step length is NaN."""
         found = sums[0] / sums[1]
         return wp.where(found <= real(0.0), real(0.0), wp.where(found >= real(1.0), real(1.0), found))
 
@@ -261,7 +267,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
 
 
 class CoarseBodies:
-    """The rows of free bodies in the coarse matrix."""
+    """The contribution of free bodies to the coarse matrix."""
 
     def __init__(self, bodies: Bodies, layout: Layout, dimension: int):
         precision, matrix = layout.precision, layout.precision.matrix

@@ -1,15 +1,16 @@
 """The force of a smooth coarse pressure on a particle, and the divergence that this pressure has to remove.
 
-The push h is the force of a constant pressure c, and the moment N is the force of a pressure's gradient. For a pressure
-k_j = c_j phi(x_j) with a linear function phi, and T = c L, the force D^T k of `cortado.solvers.projection.pressure` is
-exactly
+The push h is the force of a constant pressure c, and the moment N is the force of a pressure's gradient. For a linear
+function phi, let particle j have the pressure k_j = c_j phi(x_j). With T = c L and the gradient correction L, the force
+D^T k of `cortado.solvers.projection.pressure` is exactly
 
     (D^T k)_i = N_i grad phi + phi(x_i) h_i,
     N_i = -sum_j (T_j g_ij) x_ij^T - sum_j' eta_j c_j g_ij' x_ij^T,
-    h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij',
+    h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij'.
 
-with the images j' of particles j, whose weight eta is h in `cortado.solvers.projection.effects`. Inside the fluid and
-beside mirroring walls N is the unit matrix and h is 0, but not beside wall particles.
+The images of particles j have the index j'. Their weight eta is called h in `cortado.solvers.projection.effects`.
+Inside the fluid and beside mirroring walls, N is the unit matrix and h is 0. Beside wall particles, N and h have other
+values.
 """
 
 from functools import cache

@@ -1,7 +1,7 @@
 """Solves the equations of the coarse pressure in one kernel launch.
 
 The method is conjugate gradients (Hestenes and Stiefel 1952) with a multigrid cycle as preconditioner
-(`cortado.solvers.projection.coarse_levels`). The multigrid cycle leaves rigid bodies out.
+(`cortado.solvers.projection.coarse_levels`). The multigrid cycle does not include rigid bodies.
 
 CPUs and GPUs run the same C++ source. On a CPU, one thread solves for a scene. On a GPU, a team of blocks solves for a
 scene, and blocks wait for each other at barriers. Results do not depend on the number of blocks, because sums are made
@@ -19,7 +19,7 @@ from cortado.device.precision import Precision
 BLOCK = 512
 """Number of threads in a GPU block."""
 ALONE = 4 * BLOCK
-"""Greatest number of nodes of a level for a single block."""
+"""A single GPU block works on a level with at most this number of nodes."""
 
 ON_A_CPU = """
     const int first = thread, teams = system.members;
@@ -240,7 +240,7 @@ def system_type(precision: Precision) -> Any:
         """Rows of the matrix of rigid bodies, one after the other."""
         partial: numbers
         gate: wp.array(dtype=wp.int32)
-        """Number of waiting blocks and number of passed barriers, for each team."""
+        """Number of waiting blocks and number of passed barriers, for each team of blocks."""
         count: wp.array(dtype=wp.int32)
         """Number of iterations of the last solve in each scene (members,)."""
 

@@ -5,8 +5,8 @@ Weights and corrections are computed from the moments of the particle's neighbou
 
 M, Q and g are the moments of `cortado.solvers.projection.sums`, and gamma and nu are the sums of
 `cortado.solvers.projection.wall_sums`. H is the fullness of `cortado.sph.moment_functions`, and S(a, b) is a smoothstep
-of H from a to b. B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is near 0 beside walls. Here nu_m is the part of nu by
-mirroring walls, and q is near 0 beside other walls. The projection uses:
+of H from a to b. The factor B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is near 0 beside walls. Here nu_m is the part of
+nu from mirroring walls, and q is near 0 beside walls without mirror. The projection uses:
 
     sigma = S(0.1, 0.5) B    the part of tension that is admitted; 1 in a shut scene (see `pressure`),
     f = S(0.1, 0.5) of H + nu   the part of the previous step's pressure with which a step begins,
@@ -21,14 +21,15 @@ mirroring walls, and q is near 0 beside other walls. The projection uses:
     a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m,   the diagonal of the projection's matrix.
 
 A wave stretches the layers of fluid beside a wall, so that they no longer match the layers of wall particles. The
-divergence D then mistakes the fluid for compressed, which damps waves and stirs still water. A mirror suits any layers.
-Images therefore have the weight h, and particles of mirroring walls the weight 1 - h, with
+divergence D then mistakes the fluid for compressed, which damps waves and stirs still water. Mirror images always match
+the layers of fluid. Images therefore have the weight h, and particles of mirroring walls the weight 1 - h, with
 
-    h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4),
+    h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4).
 
-a smoothstep of the ratio of the images' part of the number density to the walls' part nu_m. h is 1 if the fluid beside
-a wall is as dense as the wall expects. It is 0 in spray and beside solids, which walls do not mirror. With g_i' = V
-grad W of the separation from an image x_j' = R x_j + o, images add
+The weight h is a smoothstep of the number density of images divided by nu_m, the number density of mirroring walls. The
+weight is 1 if the fluid beside a wall is as dense as the wall expects. The weight is 0 in spray and beside solids,
+because walls do not mirror solids. An image of particle j is at x_j' = R x_j + o, where R reflects vectors and o is an
+offset. With the kernel gradient g_i' = V grad W of the separation from the image, images add
 
     h_i sum (v_i - R v_j) . g_i'                   to the divergence,
     sum (h_i k_i + h_j k_j) g_i'                   to its transpose, the force,
@@ -51,9 +52,11 @@ from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_b
 from cortado.sph.moment_functions import moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
-"""Fullness at which each weight begins to grow from 0, and fullness at which it reaches 1."""
+"""Two values of the fullness for each weight: the weight begins to grow from 0 at the first, and is 1 from the
+second."""
 SHARED = (0.7, 0.95)
-"""Fullness at which the weight of the coarse pressure begins to grow from 0, and fullness at which it reaches 1."""
+"""Two values of the fullness: the weight of the coarse pressure begins to grow from 0 at the first, and is 1 from the
+second."""
 WALLED = 0.05
 """Wall coverage that halves the weights of tension, gradient correction and repairs."""
 APART = 0.005
@@ -66,8 +69,8 @@ NEWTON = 0.033
 """Factor of a Newton step towards the inverse of the moment matrix. A full step would make water at rest move
 faster."""
 ALONG = 0.2
-"""Corrected fraction of the missing gradient along a wall. With 0, water at rest sinks along upright walls. With 1, the
-second layer of particles rises."""
+"""Corrected fraction of the missing gradient along a wall. With the fraction 0, water at rest sinks along upright
+walls. With the fraction 1, the second layer of particles rises."""
 
 
 @cache

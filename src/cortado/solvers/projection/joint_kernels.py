@@ -4,18 +4,18 @@ A hinge keeps a point of a body A at a point of another solid B. In A's frame th
 middle to the point is then R a at the start of a step, and R' a at the predicted pose of A. At the end of the step, the
 velocity changes V - V_0 and angular velocity changes W - W_0 (`cortado.sph.free_solids`) must satisfy
 
-    b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0,
+    b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0.
 
-where p' = c' + R' a is the predicted place of each point. To this end A gets the momentum lambda at R_A a_A, and B gets
--lambda, so that momentum and angular momentum are conserved. The remaining gap is of the order of dt^4, and the next
-step removes it. In 3-D a hinge with the axis n also keeps two of the three angles. With P = I - n n^T, A gets the
-angular momentum P lambda, and B the opposite, so that
+Here p' = c' + R' a is the predicted position of each point. For this purpose A gets the momentum lambda at R_A a_A, and
+B gets -lambda. Momentum and angular momentum are therefore conserved. The remaining gap is of the order of dt^4, and
+the next step removes it. In 3-D a hinge with the axis n also fixes two of the three relative angles. With P = I - n
+n^T, A gets the angular momentum P lambda and B gets -P lambda, so that
 
     b = P ((W - W_0)_A - (W - W_0)_B) + n x (n'_A - n'_B) / dt = 0.
 
-Each of these vector equations is a block row of a linear system, and rows with the same body are coupled: b is b_0 + K
-lambda with 3 x 3 blocks K_kl. A step solves K lambda = -b_0 once for each pressure by block elimination. A solid with a
-prescribed motion gets no momentum. Only the approximate coarse grid treats bodies as free of hinges.
+All vector equations together are the linear system b = b_0 + K lambda = 0 with 3 x 3 blocks K_kl. Equations k and l are
+coupled if they contain the same body. For each pressure, a step solves K lambda = -b_0 once by block elimination. A
+solid with a prescribed motion gets no momentum. The coarse grid of the pressure is approximate and ignores hinges.
 """
 
 from collections.abc import Sequence

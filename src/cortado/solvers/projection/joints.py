@@ -23,12 +23,13 @@ BARS = ("turned_before_bar", "after_bar", "turned_bar")
 
 @dataclass(frozen=True)
 class Pair:
-    """Two equations that a body couples, as row and column of the matrix."""
+    """Two equations of hinges that a body couples. The first equation is the row of a matrix block, the second the
+    column."""
 
     block: tuple[int, int]
     body: int
     far: tuple[bool, bool]
-    """True if the body is the second solid of the hinge, for row and column."""
+    """Two flags, for the row and for the column: True if the body is the second solid of the hinge."""
 
 
 class JointArrays:
@@ -49,8 +50,8 @@ class JointArrays:
         self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:
-        """Return two matrices of equation ``k`` for the first solid of the hinge, or for the second solid if ``other``
-        is true."""
+        """Return the two matrices ``give`` and ``take`` of equation ``k``. If ``other`` is true, the matrices are for
+        the second solid of the hinge, else for the first solid."""
         way = "other_" if other else ""
         return {f"{name}{self._suffix}": self.rows[k][f"{way}{name}{self._suffix}"] for name in ("give", "take")}
 
@@ -74,7 +75,8 @@ class Row:
 
     @property
     def sides(self) -> list[tuple[int, bool]]:
-        """Return the numbers of the equation's free bodies, each with True for the second solid of the hinge."""
+        """Return the number of each free body in the equation, with a flag that is True for the second solid of the
+        hinge."""
         return [(body, other) for body, other in ((self.joint.body, False), (self.joint.other, True)) if body >= 0]
 
 
@@ -138,7 +140,8 @@ class Joints:
             yield k, row, (velocities(row, moved), self.own.rows[k], self.own.entries[k], numbers)
 
     def ends(self, step: StepContext, moved: Sequence[Arrays]) -> Iterator[tuple[int, int, bool, tuple[Named, ...]]]:
-        """Yield equation number, body number, True for the second solid of the hinge, and the arguments of ``push``."""
+        """Yield equation number, body number, a flag that is True for the second solid of the hinge, and the arguments
+        of ``push``."""
         for k, row in enumerate(self.rows):
             for body, other in row.sides:
                 signs, own = {"share": row.share, "sign": -1.0 if other else 1.0}, self.part.bodies[body].known(step)
@@ -201,7 +204,7 @@ class JointsTangent:
             step.launch(of.kernels.weigh.tangent, *changes, *known, threads=members)
 
     def join(self, step: StepContext, moved: Sequence[Arrays], moved_dot: Sequence[Arrays]) -> None:
-        """Apply the tangent of `Joints.join`. It also updates ``moved``."""
+        """Apply the tangent of `Joints.join`, and update ``moved``."""
         of, dots, members = self._joints, self._dots, self._joints.layout.members
         of.find(step, moved)
         for k, row, known in of.read(moved):

@@ -12,7 +12,7 @@ from cortado.scene.scene import Scene
 
 MARGIN = 1.05
 SMOOTHED = 1.0 / 3.0
-"""Smallest relative stiffness of the density waves that repairs remove evenly."""
+"""Repairs remove all density waves evenly that have at least this relative stiffness."""
 DEPARTURE = 0.05
 """Regularisation of the diagonal of the pressure iteration, relative to its value on the lattice."""
 

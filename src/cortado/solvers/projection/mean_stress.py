@@ -1,24 +1,25 @@
 """Values from a step of the projection: the pressure that a gauge reads, and the forces on mirroring walls.
 
-Particle j pushes particle i with the force -V (T_i + T_j) g_ij / dt, where T = k L. Wall particle b pushes particle i
-with -V k_i b_ib / dt, where b_ib is the term of b in gamma_i. The momentum flux of these forces is spread evenly along
-the line between two particles, or to the surface point s_b of the wall (Irving and Kirkwood 1950):
+Let k_i be the multiplier of particle i, L the gradient correction, and T = k L. Particle j pushes particle i with the
+force -V (T_i + T_j) g_ij / dt. Wall particle b pushes particle i with -V k_i b_ib / dt, where b_ib is the term of b in
+gamma_i. The momentum flux of these forces is spread evenly along the line between two particles, or to the surface
+point s_b of the wall (Irving and Kirkwood 1950):
 
     dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
 
-in d dimensions, where images have the weight h and mirroring walls the weight 1 - h
-(`cortado.solvers.projection.effects`). The multiplier k / dt scatters among uneven particles, and it is not a stress
-beside a wall, where neighbours are missing.
+in d dimensions. Images have the weight h and mirroring walls the weight 1 - h (`cortado.solvers.projection.effects`).
+The multiplier k / dt scatters among uneven particles. Beside a wall, where neighbours are missing, the multiplier is
+not a stress.
 
 Kernels divide impulses, which are k or dt p, by the time step.
 
-In addition to the forces of `cortado.solvers.projection.wall_sums`, mirroring walls get the forces of images, in place
-of the part h of the forces on their own wall particles,
+Mirroring walls get the forces of `cortado.solvers.projection.wall_sums` and also the forces of images. The forces of
+images replace the fraction h of the forces on the particles of mirroring walls. The change of the force is
 
     sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m,
 
-summed over the images by one solid or by all walls, with gamma_m of its mirroring wall particles. Walls receive exactly
-the momentum that the fluid loses to them.
+summed over the images by one solid or by all walls. Here gamma_m is the part of gamma from mirroring wall particles.
+Walls receive exactly the momentum that the fluid loses to them.
 """
 
 from dataclasses import replace

@@ -1,28 +1,31 @@
-"""The projection of velocities, by accelerated Jacobi iterations that let only part of negative pressures pass.
+"""The pressures of the projection, by accelerated Jacobi iterations that admit only part of the tension.
 
 Let k = dt p be the pressure impulses. With wall velocities v_b, the divergence D and its transpose, the force, are
 
     (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
     (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
 
-both with terms by images (`cortado.solvers.projection.effects`). An iteration begins with y, an extrapolation of k
+with the kernel gradient g_ij, its correction L_i, and the sum gamma_i over walls. Mirror images add terms to the
+divergence and to the force (`cortado.solvers.projection.effects`). An iteration begins with y, an extrapolation of k
 (Nesterov 1983), and computes
 
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
 
-The term b = (1 - f) max(1 - n, 0) / dt lets scattered fluid come together before it resists. The factor sigma, which is
-near 1 for surrounded particles, admits tension. The result is v* - D^T k / m.
+Here a is the diagonal of the matrix, omega the relaxation factor and beta the momentum. The term b = (1 - f) max(1 - n,
+0) / dt lets scattered fluid come together before pressure resists. n is the number density, and the weight f is 0 for
+scattered particles. The factor sigma, which is near 1 for surrounded particles, admits tension. The resulting velocity
+is v* - D^T k / m.
 
 A step begins with the pressure of the previous step. The first k is f times the last k. The first v is v* + f w, with
 the velocity change w = -D^T k / m of the previous step.
 
-Some particles begin without pressure, with v*: those that w would move towards a wall, gamma . w > 0, by more than a
-tenth of a spacing. Between walls less than a spacing apart, the pressure from one wall would otherwise throw a particle
-at the other wall, harder in each step. This choice has no derivative.
+A particle begins without pressure, and with the velocity v*, if w would move it more than a tenth of a spacing towards
+a wall. Otherwise, between walls less than a spacing apart, the pressure from one wall would throw a particle at the
+other wall, harder in each step. The choice of these particles has no derivative.
 
-A scene is shut if every particle has a share c of the coarse pressure. In a shut scene tension is also admitted beside
-walls, sigma = 1, because fluid that fills a container cannot leave the walls.
+A scene is shut if it has no free surface: the weight c of the coarse pressure is positive for every particle. In a shut
+scene tension is also admitted beside walls, sigma = 1, because fluid that fills a container cannot leave the walls.
 
 A scene is warm if any particle begins with a pressure, and cold if none does. In a cold scene a coarse correction also
 precedes the first iteration.
@@ -49,7 +52,7 @@ from cortado.sph.moment_functions import symmetric
 
 @cache
 def clamp_functions(precision: Precision) -> SimpleNamespace:
-    """Make Warp functions for the limitation of tension."""
+    """Make Warp functions that limit tension."""
     real = precision.real
 
     @wp.func
@@ -65,8 +68,6 @@ def clamp_functions(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def parts(up: real, down: real):
-        """Return weights of the slopes for positive and for negative pressure. Each weight is one half at
-        pressure 0."""
         rise, fall = real(0.0), real(0.0)
         if up > real(0.0):
             rise = real(1.0)

@@ -1,18 +1,19 @@
-"""Repairs of the density, which change only positions. They are Jacobi iterations from x', the positions after the
-shift:
+"""Repairs of the density, by Jacobi iterations that change only positions. The iterations begin at x', the positions
+after the shift:
 
     lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
     d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
 
-with images in the number density n and in d (`cortado.solvers.projection.effects`).
+with multipliers lambda, displacements d, the number density n and the mass m of a particle divided by its volume.
+Mirror images contribute to n and to d (`cortado.solvers.projection.effects`).
 
 A displacement is at most a sixth of a spacing s. Where walls leave no room, unbounded repairs would throw a particle
 through a wall.
 
-Each iteration has its own relaxation factor omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed,
+Iteration k has its own relaxation factor omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed,
 because a repair would then act a second time in the next step. The factor r of `cortado.solvers.projection.effects`
-restricts repairs of low densities to the interior. The gradients g and the diagonal a are those at the start of the
-step. n is computed at the positions x_k, over the neighbours at the start of the step.
+restricts repairs of low densities to the interior. The kernel gradients g_ij, the wall sums gamma_i and the diagonal a
+are from the start of the step. Only n is computed at the positions x_k, over the neighbours from the start of the step.
 """
 
 from functools import cache

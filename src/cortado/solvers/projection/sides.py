@@ -1,17 +1,19 @@
 """Keeps particles on their side of a sheet: a particle that ends a step on the other side is moved back.
 
 In the frame of a sheet a particle is at y_0 before the step and at y after the step. A face of the sheet has the normal
-n, and h = n . (y - a) is the height of the particle above the face, with a point a of the face. The path from y_0 to y
-may cross the face, or end nearer to it than e = s / 20 with the spacing s. The particle is then put back on the side of
-y_0:
+n and contains a point a. The height of the particle above the face is h = n . (y - a), and h_0 before the step. The
+path from y_0 to y may cross the face, or end nearer to the face than e = s / 20 with the spacing s. The particle is
+then put back on the side of y_0:
 
     y' = y + (e sign h_0 - h) n.
 
 This is done up to three times, each time with the face that the path meets first. If the path still crosses the sheet,
 as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0.
 
-If a pose changes by c', w' and g' (`MovingWalls`), its points x move by t(x) = c' + w' x (x - c) + g' (x - c). With N =
-R n, a relative change D = x' - t(x) becomes D - N (N . D + e sign h_0 g'), and then t is added again.
+For derivatives, let the middle c of the solid move by c', and let the solid turn by the small vector w' and grow by the
+relative amount g' (`MovingWalls`). A point x of the solid then moves by t(x) = c' + w' x (x - c) + g' (x - c). A
+particle that moves by x' moves by D = x' - t(x) relative to the solid. With the normal N of the face in the scene, D
+becomes D - N (N . D + e sign h_0 g'), and then t is added again.
 """
 
 from functools import cache
@@ -67,8 +69,8 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def time_of(start: vector, y: vector, face: int, least: real, sheets: sheets_of) -> real:
-        """Return the fraction of the path before a face, 1 if the path only ends too close to the face, or 2 without
-        contact."""
+        """Return the fraction of the path before the face. Return 1 if the path ends too close to the face without
+        crossing it, and 2 if the path does not meet the face."""
         n, a = sheets.faces.normals[face], sheets.faces.places[face, 0]
         side = side_of(start, face, sheets)
         h_0, h = side * wp.dot(n, start - a), side * wp.dot(n, y - a)

@@ -4,16 +4,17 @@ density.
 A step moves particles by dt v and by the shift delta, repairs densities, and optionally corrects velocities.
 
 Particles of the interior are shifted towards regions with fewer particles (Lind et al. 2012; Skillen, Lind, Stansby and
-Rogers 2013). Pairs of particles that are nearer than 0.65 s, with the spacing s, are moved apart everywhere. The rate
-follows the velocity gradient and the tension, so that the shift does not stir a fluid at rest:
+Rogers 2013). Pairs of particles that are nearer than 0.65 s, with the spacing s, are moved apart everywhere. The rate r
+increases with the velocity gradient and the tension, so that the shift does not stir a fluid at rest:
 
     delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
     grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
-    r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2),
+    r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2).
 
-with smooth bounds of 0.5 on r, and of 0.1 s on |delta|. Under tension particles clump (the tensile instability,
-Monaghan 2000), so the shift is faster there. P projects out the direction of the surface, g + gamma. The weights u and
-w are from `cortado.solvers.projection.effects`: u is 0 at surfaces, and w, the weight of repairs of low densities, is 0
+Here C is the concentration of particles, g_ij the kernel gradient, and gamma the sum over walls. Smooth bounds limit r
+to 0.5 and |delta| to 0.1 s. Under tension particles clump (the tensile instability, Monaghan 2000), so the shift is
+faster there. P projects out the direction of the surface, g + gamma, where g is the sum of g_ij. The weights u and w
+are from `cortado.solvers.projection.effects`: u is 0 at surfaces, and w, the weight of repairs of low densities, is 0
 near surfaces and beside walls. The shift does not change velocities, because a correction by (delta . grad) v adds
 energy.
 
@@ -22,7 +23,8 @@ and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
-where x_K are the positions after the last repair, and A is from the last iteration of the pressure.
+where M is the moment matrix, I the unit matrix, and x_K are the positions after the last repair. A is from the last
+iteration of the pressure.
 
 The repairs of the density begin from x + dt v + delta.
 """
@@ -66,7 +68,7 @@ GREATEST = 0.5
 FARTHEST = 0.1
 """Greatest shift of a particle in a step [spacings]."""
 SURFACE = 0.03
-"""Smallest magnitude of the surface normal vector, times the spacing, that determines a direction."""
+"""Magnitude of the surface normal vector times the spacing. Below this value a particle has no surface direction."""
 AWAY = 4.0
 """Additional factor for moving close pairs apart."""
 LEAST = 1e-5
@@ -168,8 +170,8 @@ class ProjectionSteps(ParticleSolver):
         self._iterate_kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._repair_kinds = {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates: list[dict[str, wp.array]] = []
-        """Velocities, velocity gradients, divergences and pressures before each iteration. The last entry is the
-        result."""
+        """Velocities, velocity gradients, divergences and pressures before each iteration. The last element of the list
+        contains the result."""
         self.corrected: list[dict[str, wp.array]] = []
         """Velocities and pressures after each coarse correction."""
         self.repaired: list[dict[str, wp.array]] = []
@@ -296,12 +298,12 @@ class ProjectionSteps(ParticleSolver):
         return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
-        """Return the divergence by moving walls, with free bodies under the pressures of an iteration."""
+        """Return the divergence due to moving walls. Free bodies move under the pressures of the iteration."""
         drift = self.density.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 
     def settle(self, context: StepContext, last: int) -> None:
-        """Write the positions after the new velocities and the shift."""
+        """Write the positions that follow from the new velocities and the shift."""
         if self.bodies is not None:
             self.bodies.settle(context, self.iterates[last]["y"])
         end, first = self.end_of(last), self.repaired[0]

@@ -24,9 +24,10 @@ UNEQUAL = 2.0
 
 @cache
 def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the sums over neighbours. A symmetric matrix is its diagonal and its entries yz, xz and xy.
+    """Make the sums over neighbours. A symmetric matrix is stored as its diagonal and its components yz, xz and xy.
 
-    - ``moments``: six sums, with the spacing l. ``per_nearest`` is 1 / (V W(l)), ``per_apart`` 1 / (0.65 l)^2.
+    - ``moments``: six sums, with the spacing l and R = `CROWDED`. The kernel gradient is g_ij. The argument
+      ``per_nearest`` is 1 / (V W(l)), and ``per_apart`` is 1 / (0.65 l)^2.
 
           M = -sum g_ij x_ij^T
           Q = sum h_ij g_ij g_ij^T / m_j,  h_ij = 1 + 2 ((m_i - m_j) / (m_i + m_j))^2

@@ -1,34 +1,35 @@
-"""Sums by which walls push a particle in the projection, with derivatives.
+"""Sums over walls for the force of walls on a particle in the projection, with derivatives.
 
-With g_ib = V grad W_ib, of which n_b n_b^T g_ib is the part along the normal of a wall, the sums over wall particles b
-with weights w_b are
+Wall particle b has the weight w_b, the normal n_b and the kernel gradient g_ib = V grad W_ib. The part of g_ib along
+the normal is n_b n_b^T g_ib. The sums over wall particles are
 
     normal = sum w_b n_b n_b^T g_ib,   whole = sum w_b g_ib,   nu = V sum w_b W_ib,
 
 and for moving walls with velocities v_b the drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls
 push along
 
-    gamma = normal + e (whole - normal),   e = S(0.1, 0.4) of (whole^2 - normal^2) / (whole^2 + 0.01 a_0 / 20).
+    gamma = normal + e (whole - normal),   e = S(0.1, 0.4) of (whole^2 - normal^2) / (whole^2 + 0.01 a_0 / 20),
 
-Along a flat wall and in a concave corner the edge factor e is 0, so that the arrangement of wall particles causes no
-friction. At an edge that protrudes into the fluid the parts along normals add up to only a third of the missing sum,
-and e is 1.
+where S(0.1, 0.4) is a smoothstep from 0.1 to 0.4. Along a flat wall and in a concave corner the edge factor e is 0, so
+that the arrangement of wall particles causes no friction. At an edge that protrudes into the fluid, ``normal`` is only
+a third of the missing sum, and e is 1.
 
 The pressure of a particle pushes the walls of one solid s along gamma_s / V,
 
-    gamma_s = normal_s + e (whole_s - normal_s)
+    gamma_s = normal_s + e (whole_s - normal_s).
 
-with the sums above over the wall particles of the solid, and e from the sums over all walls.
+The sums normal_s and whole_s are over the wall particles of the solid, and e is from the sums over all walls.
 
 Flat faces of moving solids act through images of the fluid instead of wall particles. In reverse mode a sum over images
 is a work W that is linear in adjoints,
 
     W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R (u_j + B_j x_ij)) . g_i' + e_i swept . g_i' / dt
-               - 1/2 h_i k_i (q_i + q_j) x_i' . g_i'),
+               - 1/2 h_i k_i (q_i + q_j) x_i' . g_i').
 
-because ``lift`` is the transpose of ``spread``. B is the slope of the push by a coarse pressure. Warp differentiates W
-with respect to the poses of the solid before and after the step. Gradients with respect to particle positions are in
-other modules, except the part through the edge factor e.
+Here h, b, c, d and e are the arrays ``image``, ``density``, ``weighted``, ``spread`` and ``swept`` of `NUMBERS`. W_i',
+g_i' and x_i' are the kernel, its gradient and the separation for an image, and R is the reflection. B is the slope of
+the push by a coarse pressure. Warp differentiates W with respect to the poses of the solid before and after the step.
+Gradients with respect to particle positions are in other modules, except the part through the edge factor e.
 """
 
 from collections.abc import Iterator, Mapping
@@ -155,7 +156,7 @@ def beside_term(d: Discretisation) -> Any:
 
 @cache
 def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the force of a pressure on a solid."""
+    """Make the kernels of the force of pressure on a solid."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
 
@@ -315,7 +316,7 @@ def face_share_kernel(discretisation: Discretisation) -> Any:
 
 
 class FaceShares:
-    """Terms of particles in the adjoints of solids, through mirror images."""
+    """The contributions of particles, through mirror images, to the adjoints of solids."""
 
     def __init__(self, system: ParticleSystem):
         self._kernel, self._faces = partial(face_share_kernel, system.discretisation), len(system.faces.solids)
@@ -337,7 +338,8 @@ def weights_type(precision: Precision) -> Any:
 
 
 def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -> TypesByName:
-    """Return the Warp types of the names in sums and kernels. Other names are numbers. ``more`` takes precedence."""
+    """Return the Warp types of the names in sums and kernels. All other names have the type of a number. ``more`` takes
+    precedence."""
     common = {
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
