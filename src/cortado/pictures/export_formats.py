@@ -197,11 +197,12 @@ class _Writer:
 
 def _pxr() -> Any:
     try:
+        found = import_module("pxr")
         for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "Vt"):
             import_module(f"pxr.{name}")
     except ImportError as error:
         raise ExtraMissingError("USD", "usd-core") from error
-    return import_module("pxr")
+    return found
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:

@@ -347,7 +347,7 @@ class ParameterSpace:
             place = "" if self._batch is None else f"In scene {number} of the batch, "
             raise OutOfRangeError(f"{place}{error}") from error
         upright = self._one.upright(values)
-        unstable = unstable_sentence(upright, simulation.scene, self._told)
+        unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
         for sentence in filter(None, (crowded, unstable)):
             warn(sentence)
 

@@ -7,7 +7,6 @@ descriptions in the schema.
 
 import ast
 import inspect
-import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -122,7 +121,7 @@ Angle = Annotated[float, quantity("rad")]
 
 
 def _not_zero(vector: tuple[float, ...]) -> tuple[float, ...]:
-    if math.hypot(*vector) < 1.0 / GREATEST:
+    if not any(vector):
         raise field_error((), vector, "a vector that is not zero")
     return vector
 
