@@ -234,7 +234,7 @@ def summed(
     }
     exec(text, known)
     made: Any = wp.Function(known[name], name, "", module=module, source=text)
-    made.shares_lanes = True  # which `cortado.device.precision.check_lanes` looks for
+    made.shares_lanes = True  # which `cortado.device.precision.check_sum` looks for
     made.arrays, made.others, made.results, made.discretisation = arrays, others, results, d
     return made
 

@@ -280,7 +280,7 @@ def _without_lost(lost: OfLost, state: State) -> State:
 def flat_of(arrays: Sequence[Any]) -> wp.array | None:
     """Return a flat Warp array in the memory of ``arrays``. Return None if the arrays are not contiguous in memory."""
     first = arrays[0] if arrays else None
-    if not isinstance(first, wp.array):
+    if not isinstance(first, wp.array) or not all(array.size for array in arrays):
         return None
     end = first.ptr
     for array in arrays:

@@ -98,8 +98,9 @@ class WithinBar:
 class Solver(Protocol):
     """Protocol of the solver of a scene or of a batch, on one device. Several rollouts may share a solver.
 
-    Only the methods `make_room` and `reset` wait for the device. A solver without derivatives raises `InputError` from
-    `tangent`, `adjoint` and `differentiable`.
+    Only `make_room`, and `reset` to a later step than the first, wait for the device. A rollout captures `reset` to the
+    first step as a graph. A solver without derivatives raises `InputError` from `tangent`, `adjoint` and
+    `differentiable`.
     """
 
     discretisation: Discretisation

@@ -148,7 +148,8 @@ def _call_on_gpu(frame: Any) -> None:
     with WARP:
         wp.init()
         ordinal = xla_ffi.get_device_ordinal_from_callframe(frame)
-        theirs, own = _streams(ordinal, xla_ffi.get_stream_from_callframe(frame))
+        own = _own_stream(ordinal)
+        theirs = _stream_at(ordinal, xla_ffi.get_stream_from_callframe(frame))
         own.wait_stream(theirs)
         with wp.ScopedStream(own, sync_enter=False):
             _call(frame, own.device)
@@ -156,9 +157,14 @@ def _call_on_gpu(frame: Any) -> None:
 
 
 @cache
-def _streams(ordinal: int, address: int) -> tuple[Any, Any]:
-    device = wp.get_cuda_device(ordinal)
-    return wp.Stream(device, cuda_stream=address), wp.Stream(device)
+def _own_stream(ordinal: int) -> Any:
+    """Return the one stream of all calls on a GPU, which orders them."""
+    return wp.Stream(wp.get_cuda_device(ordinal))
+
+
+@cache
+def _stream_at(ordinal: int, address: int) -> Any:
+    return wp.Stream(wp.get_cuda_device(ordinal), cuda_stream=address)
 
 
 def _handler(call: Callable[[Any], None]) -> Any:
@@ -168,12 +174,13 @@ def _handler(call: Callable[[Any], None]) -> Any:
     def handle(pointer: Any) -> Any:
         frame = pointer.contents
         try:
-            if not frame.extension_start:
-                call(frame)
-            elif frame.extension_start.contents.type == xla_ffi.XLA_FFI_Extension_Type.Metadata:
-                extension = ctypes.cast(frame.extension_start, ctypes.POINTER(xla_ffi.XLA_FFI_Metadata_Extension))
+            asked = frame.extension_start
+            if asked and asked.contents.type == xla_ffi.XLA_FFI_Extension_Type.Metadata:
+                extension = ctypes.cast(asked, ctypes.POINTER(xla_ffi.XLA_FFI_Metadata_Extension))
                 version = extension.contents.metadata.contents.api_version
                 version.major_version, version.minor_version = 0, 1
+            else:
+                call(frame)
         except Exception as error:
             if not isinstance(error, CortadoError):
                 traceback.print_exc()

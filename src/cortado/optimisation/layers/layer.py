@@ -252,14 +252,16 @@ class NamedStates(HostStates):
     def state(self, rollout: Rollout, state: State, steps: int, begun: Any = None) -> Named:
         """Return the state of a rollout after ``steps`` steps as named arrays. Arrays of lost scenes contain NaN. On a
         GPU, the next call overwrites the returned arrays."""
-        return self._returned(self.read(state, dict.fromkeys(rollout.lost, np.nan)), scenes_after(rollout, steps))
+        found = self._returned(self.read(state, dict.fromkeys(rollout.lost, np.nan)), scenes_after(rollout, steps))
+        if not self._is_cpu:
+            self._later.numpy()[:] = np.ravel(found[STATE_TIME])
+            found[STATE_TIME] = self._later
+        return found
 
     def arrays(self, state: DeviceState) -> Named:
-        """Copy a state on the device to named arrays."""
-        found = self._returned(self.read(state.arrays, {}), state.scenes)
-        if not all(scene in self._simulation.judged_states for scene in state.scenes):
-            self._last = None
-        return found
+        """Return a state on the device as named arrays. On a GPU, the next reading overwrites the arrays."""
+        judged = all(scene.origin and scene in self._simulation.judged_states for scene in state.scenes)
+        return self._returned(self.read(state.arrays, {}), state.scenes, judged)
 
     def restart_states(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return the restart states of all scenes, given the parameter ``values`` of the next steps. Raises
@@ -310,25 +312,23 @@ class NamedStates(HostStates):
             else:
                 own.assign(on_host(array).reshape(own.shape))
 
-    def _returned(self, fields: dict[str, Array], scenes: Sequence[RestartState]) -> Named:
-        """Add the clocks of all scenes to the fields of a state. On a CPU, remember the state as valid."""
+    def _returned(
+        self, fields: dict[str, Array], scenes: Sequence[RestartState], judged: bool = True
+    ) -> dict[str, Array]:
+        """Add the clocks of all scenes to the fields of a state. On a CPU, remember a ``judged`` state as valid."""
         members, found = self.shapes[STATE_TIME], dict(fields)
         found[STATE_TIME] = np.reshape([scene.clock.time for scene in scenes], members)
-        if not self._is_cpu:
-            self._later.numpy().reshape(members)[...] = found[STATE_TIME]
-            found[STATE_TIME] = self._later
         if LAST_STEP in self.shapes:
             found[LAST_STEP] = np.reshape([scene.clock.time_step for scene in scenes], members)
-        if self._is_cpu and all(scene.origin for scene in scenes):
-            self._forget_last()
+        if self._is_cpu and judged:
+            self._remember_last()
             self._last = self._bytes(found), tuple(scenes)
         return found
 
-    def _forget_last(self) -> None:
+    def _remember_last(self) -> None:
         if self._last is not None:
             numbers, scenes = self._last
             self._remember(self._checksum(numbers), tuple(scene.origin for scene in scenes if scene.origin))
-            self._last = None
 
     def _follows(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return the scenes of the last returned state if ``given`` is the same state. Otherwise return an
@@ -336,21 +336,18 @@ class NamedStates(HostStates):
         if self._last is None or not values.keys().isdisjoint(("time_step", "rest_density")):
             return ()
         numbers, scenes = self._last
-        if self._bytes(given) != numbers:
-            return ()
-        self._last = None
-        return scenes
+        return scenes if self._bytes(given) == numbers else ()
 
     def _bytes(self, given: Named) -> dict[str, bytes]:
         real = self._simulation.precision.numpy
-        return {name: np.asarray(given[name], dtype=real).tobytes() for name in self.shapes}
+        return {name: np.asarray(on_host(given[name]), dtype=real).tobytes() for name in self.shapes}
 
     def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Check a state, and return restart states of all scenes without fields."""
         if scenes := self._follows(given, values):
             self._simulation.judged_states.update(scenes)
             return scenes
-        self._forget_last()
+        self._remember_last()
         solver = self._simulation.scene.solver
         times, sizes = (self._numbers(given, name) for name in (STATE_TIME, LAST_STEP))
         steps = np.full(times.shape, values.get("time_step", 1.0 if solver.chooses else solver.time_step))
