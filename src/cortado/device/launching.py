@@ -227,9 +227,12 @@ class CapturedGraph:
     """Launches with fixed arrays that are replayed as a captured graph. Unless ``is_warm`` is true, the first call runs
     without a graph, because capture forbids loading modules and allocating memory."""
 
-    def __init__(self, work: Callable[[], None], launch: KernelLauncher, is_warm: bool = False):
+    def __init__(self, work: Callable[[], None], launch: KernelLauncher, is_warm: bool = False, lends: bool = True):
+        """Prepare to capture ``work``. If ``lends`` is true, other threads may use Warp while a CPU replays the graph,
+        which takes longer than a graph of a few fills."""
         self._work, self._launch = work, launch
         self._warm, self._graph = is_warm, None
+        self._lends = lends and bool(launch.device.is_cpu)  # a GPU has one queue for all threads
 
     def __call__(self) -> None:
         if not self._warm or not self._launch.capturable:
@@ -240,7 +243,7 @@ class CapturedGraph:
             with wp.ScopedCapture(device=self._launch.device) as capture:
                 self._work()
             self._graph = capture.graph
-        with WARP.lent() if self._launch.device.is_cpu else nullcontext():  # a GPU has one queue for all threads
+        with WARP.lent() if self._lends else nullcontext():
             wp.capture_launch(self._graph)
 
 

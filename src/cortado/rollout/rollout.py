@@ -276,7 +276,7 @@ class Rollout(Staying):
             return
         self._generation, self._warm = self.solver.generation, set[Beside | None]()
         self._chunks: dict[tuple[int, Beside | None, bool], CapturedGraph] = {}
-        self._reset = CapturedGraph(self.solver.reset, self.solver.launch)
+        self._reset = CapturedGraph(self.solver.reset, self.solver.launch, lends=False)
         self._steps_back: dict[tuple[BackwardStep, Counts], CapturedGraph] = {}
         self._steps_along: dict[Counts, CapturedGraph] = {}
 

@@ -72,9 +72,9 @@ class LayerParameters:
 
     def on_device(self, given: Named) -> dict[str, Array]:
         own = part(given, PARAMETER)
-        stay = {name: array for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
-        others = {PARAMETER + name: array for name, array in own.items() if name not in stay}
-        return {**self.values(others), **{name: self._shaped(name, array) for name, array in stay.items()}}
+        stays = {name for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
+        each = {name: array if name in stays else on_host(array).astype(np.float64) for name, array in own.items()}
+        return {name: self._shaped(name, array) for name, array in each.items()}
 
     def _shaped(self, name: str, array: Array) -> Array:
         shapes = self._space.shapes(name)

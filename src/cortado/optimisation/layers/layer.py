@@ -9,7 +9,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import blake2b
 from itertools import repeat
 from typing import Any, TypeVar
 
@@ -229,7 +228,7 @@ class NamedStates(HostStates):
         self._all_packed = dict[State, Packed]()
         self._last: tuple[dict[str, bytes], tuple[RestartState, ...]] | None = None
         """Bytes of the last returned state by array name, and the restart states of its scenes. Used on a CPU only."""
-        self._known: OrderedDict[bytes, tuple[Origin, ...]] = OrderedDict()
+        self._known: OrderedDict[bytes | int, tuple[Origin, ...]] = OrderedDict()
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -328,7 +327,7 @@ class NamedStates(HostStates):
     def _remember_last(self) -> None:
         if self._last is not None:
             numbers, scenes = self._last
-            self._remember(self._checksum(numbers), tuple(scene.origin for scene in scenes if scene.origin))
+            self._remember(self._hash(numbers), tuple(scene.origin for scene in scenes if scene.origin))
 
     def _follows(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Return the scenes of the last returned state if ``given`` is the same state. Otherwise return an
@@ -360,7 +359,7 @@ class NamedStates(HostStates):
 
     def _origins(self, given: Named, clocks: list[Clock], values: Arrays) -> tuple[Origin, ...]:
         own = {name: values[name] for name in ("rest_density",) if name in values}
-        key = self._checksum(self._bytes(given)) if self._is_cpu else np.asarray(own.get("rest_density", ())).tobytes()
+        key = self._hash(self._bytes(given)) if self._is_cpu else np.asarray(own.get("rest_density", ())).tobytes()
         if key not in self._known:
             if self._is_cpu:
                 self._space.check_restarts(self._states(given, clocks, [None] * len(clocks)), own)
@@ -403,13 +402,13 @@ class NamedStates(HostStates):
         room = 2.0 * float(np.finfo(self._simulation.precision.numpy).eps)
         return Clock(steps, steps * step) if abs(time - steps * step) <= room * time else Clock(0, time)
 
-    def _remember(self, key: bytes, origins: tuple[Origin, ...]) -> None:
+    def _remember(self, key: bytes | int, origins: tuple[Origin, ...]) -> None:
         self._known[key] = origins
         while len(self._known) > 256:
             self._known.popitem(last=False)
 
-    def _checksum(self, numbers: Mapping[str, bytes]) -> bytes:
-        return blake2b(b"".join(numbers[name] for name in self.fields), digest_size=16).digest()
+    def _hash(self, numbers: Mapping[str, bytes]) -> int:
+        return hash(tuple(numbers[name] for name in self.fields))
 
 
 def check_state(given: Shapes, wanted: Shapes) -> None:
