@@ -97,7 +97,7 @@ REFUSED = [
     (lambda at: at.act(np.array([np.nan, 0])), "action has a value that is not finite, but must be numbers from"),
     (lambda at: at.act("left"), "action is 'left', but must be a number or an array of real"),
     (lambda at: at.jax.jit(lambda a: at.act(a)[1])(at.np.zeros(2)), "action is JitTracer(float64[2]), but must be a"),
-    (lambda at: at.env.reset(seed="a"), "seed is 'a', but must be a whole number or None."),
+    (lambda at: at.env.reset(seed="a"), "seed is 'a', but must be a whole number of at least 0."),
     (lambda at: at.vec.reset(seed="ab"), "seed is 'ab', but must be a whole number, or a list of them."),
     (lambda at: at.act_all(np.zeros(2)), "actions has shape (2,), but must be (2, 2)."),
     (lambda at: at.vec.twin(2), "number is 2, but must be at most 1."),
