@@ -151,8 +151,8 @@ class Renderer:
 
         Args:
             positions: a frame, positions (n, d) [m], or a Warp array (n,) of vectors in the renderer's precision and on
-            its device. A frame, such as ``trajectory[-1]`` or ``problem.end(parameters)``, also contains mass
-            fractions and perhaps colours.
+                its device. A frame, such as ``trajectory[-1]`` or ``problem.end(parameters)``, also contains mass
+                fractions and perhaps colours.
             fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; not needed for a single phase.
             colours: (phases, 3) colours of the phases; by default the renderer's colours.
 
