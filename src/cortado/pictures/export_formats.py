@@ -27,7 +27,7 @@ Advance = Callable[[], None]
 
 
 def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write a glTF file for each frame, with the y axis up and linear colours, and return the folder."""
+    """Write the y axis upwards and colours as linear numbers, as glTF requires."""
     import trimesh
 
     upright = Pose(run.up, np.zeros(3)).matrix
@@ -44,8 +44,7 @@ def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
 
 
 def _write_series(run: Exported, folder: Path, advance: Advance, ending: str, text: Callable[[Any], Any]) -> list[str]:
-    """Write one file for each frame. The function ``text`` makes the contents of a file. Return the entries of a
-    ParaView collection."""
+    """Return the XML entries of a ParaView collection."""
     entries = []
     for number, frame in enumerate(run.frames(run.series)):
         files: dict[str, Any] = {"particles": (_numbered("particles", number, ending), frame)}
@@ -69,7 +68,7 @@ def _write_meshes(run: Exported, folder: Path, advance: Advance, ending: str) ->
 
 
 def write_vtp(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write VTK files with all fields of the particles. Return ``run.pvd``, which lists the files and their times."""
+    """Return the path of ``run.pvd``, the ParaView collection of the written files."""
     entries = _write_series(run, folder, advance, "vtp", _vtp)
     lines = ['<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries, "  </Collection>", "</VTKFile>"]
     write_atomically(folder / "run.pvd", "\n".join([*lines, ""]))
@@ -94,12 +93,8 @@ def _linear(colours: Any) -> Any:
 
 
 def write_usd(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write ``run.usdc`` and return its path. The file has the mesh ``/run/surface``, the points ``/run/particles``,
-    and for each solid a transform ``/run/solid_NAME`` with a mesh.
-
-    Frame k of `WholeFrames` is at time code k, and the file stores the frame rate. Lengths are in metres, and colours
-    are linear.
-    """
+    """Write the prims ``/run/surface``, ``/run/particles`` and ``/run/solid_NAME``. Frame k has the time code k.
+    Lengths are in metres, and colours are linear."""
     pxr = _pxr()
     path = folder / "run.usdc"
     temporary = unfinished(path).with_suffix(".usdc")
@@ -206,7 +201,6 @@ def _pxr() -> Any:
 
 
 def _vtp(what: ExportedFrame | Mesh) -> str:
-    """Return the text of a VTP file with the particles of a frame or with a mesh."""
     colours = {"colour": srgb_bytes(what.colours)}
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
@@ -225,7 +219,7 @@ def _vtp(what: ExportedFrame | Mesh) -> str:
 
 
 def _polydata(points: np.ndarray, corners: np.ndarray, cells: str, fields: Mapping[str, np.ndarray]) -> Any:
-    """Make a VTK data set of points (p, 3) [m], cells (c, k) with k corners each, and fields (p, ...) by name."""
+    """The positions ``points`` (p, 3) are in metres, and ``corners`` (c, k) are point numbers of cells."""
     vtk = _vtk()
     data, places, topology = vtk.vtkPolyData(), vtk.vtkPoints(), vtk.vtkCellArray()
     places.SetData(_array("points", points))
@@ -268,7 +262,7 @@ FORMATS: dict[str, Callable[[Exported, Path, Advance], Path]] = {
 def export(
     trajectory: Trajectory, folder: str | Path, to: str, scene: Scene | str | Path, simulation: Computed = None
 ) -> Path:
-    """Export a trajectory to files for another program, as `Trajectory.export` does. Return the path to open."""
+    """Return the path that another program opens. See `Trajectory.export`."""
     if to not in FORMATS:
         raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
     if not len(trajectory):
@@ -293,7 +287,7 @@ def export(
 
 
 def labelled(trajectory: Trajectory) -> Any:
-    """Return a trajectory as a dataset of xarray. See `Trajectory.to_xarray`."""
+    """Implement `Trajectory.to_xarray`."""
     try:
         import xarray
     except ImportError as error:

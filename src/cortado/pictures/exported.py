@@ -1,8 +1,5 @@
-"""The data of a run for export: the particles, the surface of the fluid, and the solids.
-
-Surfaces end at container walls and enclose the volume of their particles. To reach this volume, all surface points of a
-connected body of fluid are moved in or out by the same distance.
-"""
+"""The data of a run for export: the particles, the surface of the fluid, and the solids.  Surfaces end at container
+walls and enclose the volume of their particles."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -41,8 +38,7 @@ MOST_SHIFT = 1.0
 
 @dataclass(frozen=True)
 class WholeFrames:
-    """Evenly spaced frames of an animation. Frame k is at the time start + k / rate. The particles of a frame are
-    extrapolated from a recorded state to the time of the frame."""
+    """Evenly spaced frames of an animation, extrapolated from recorded states."""
 
     rate: float
     """Frame rate [1/s]."""
@@ -57,9 +53,7 @@ class WholeFrames:
 
     @classmethod
     def of(cls, times: NDArray[np.float64], marks: Marks | None = None) -> "WholeFrames":
-        """Choose frames for states recorded at ``times`` (m,) [s]. With ``marks``, the frames are at the marks. Without
-        marks, the frames are at the states if the states are evenly spaced in time. Otherwise the frame rate is a round
-        number that gives each state a frame. If no round number does, the frame rate is the mean rate of the states."""
+        """Choose frames for recorded ``times`` (m,) [s]. Without ``marks``, prefer a round frame rate."""
         if marks is not None:
             whole = marks.at(np.arange(int(marks.passed(times[-1:])[0]) + 1))
             recorded = np.searchsorted(times, whole - SAME / marks.rate)
@@ -103,12 +97,11 @@ class Pose:
     """Position (3,) [m]."""
 
     def of(self, mesh: Mesh) -> Mesh:
-        """Return the mesh of a solid at this pose."""
         return replace(mesh, points=mesh.points @ self.turn.T + self.position, normals=mesh.normals @ self.turn.T)
 
     @property
     def matrix(self) -> Points:
-        """Return the pose as a matrix (4, 4) for column vectors."""
+        """Transformation matrix (4, 4) for column vectors."""
         return np.block([[self.turn, self.position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
@@ -140,8 +133,6 @@ class ExportedFrame:
 
 
 class Exported:
-    """The data of a run and its scene for export. Raises `InputError` if colours cannot be computed."""
-
     def __init__(self, trajectory: Trajectory, scene: Scene, simulation: Computed = None):
         self.times, self.scene = trajectory.times, scene
         self._values = coloured_by(scene, trajectory, simulation)
@@ -153,12 +144,10 @@ class Exported:
             self.solids.append(_solid(one, part, name in trajectory.solids))
         self._trajectory = trajectory
         self.up = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(3)
-        """Rotation matrix (3, 3) that turns the upward direction of the scene to the y axis. The upward direction is
-        opposite to gravity."""
+        """Rotation matrix (3, 3) that turns the upward direction of the scene to the y axis."""
         self.spacing = scene.discretisation.spacing
         self._held = (0.0, 0.0, 1.0, 1.0)
-        """Greatest relative difference so far between the volumes of surface and fluid, the time of this difference
-        [s], and both volumes [m³]."""
+        """The worst frame so far: relative volume error, time [s], volumes of surface and fluid [m³]."""
 
     @cached_property
     def whole(self) -> WholeFrames:
@@ -166,12 +155,11 @@ class Exported:
 
     @property
     def series(self) -> WholeFrames | None:
-        """Return the evenly spaced frames of a series of files, or None if all recorded states are written."""
+        """Frames of a series of files, or None to write every recorded state."""
         return None if self._trajectory.marks is None else self.whole
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """Yield the evenly spaced frames ``whole``, or by default all recorded states. Yield them one at a time to save
-        memory."""
+        """Yield the frames ``whole``, or by default all recorded states."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
         solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
@@ -252,12 +240,9 @@ def enclosed(points: Points, triangles: np.ndarray) -> float:
 def with_volume(
     points: Points, triangles: Numbers, ways: Points, places: Points, spacing: float, kept: Callable[[Points], Points]
 ) -> Points:
-    """Move the points (p, 3) [m] of a surface until the surface encloses the volume of the particles. The volume of one
-    particle is ``spacing``³.
-
-    ``ways`` (p, 3) are outward unit vectors or 0, and ``places`` (n, 3) [m] are positions of particles. ``kept`` moves
-    points beyond a wall back to the wall.
-    """
+    """Move the points (p, 3) [m] of a surface until the enclosed volume is n ``spacing``³ for n particles.
+    ``ways`` (p, 3) are outward unit vectors or 0, and ``places`` (n, 3) [m] are particles. ``kept`` moves points beyond
+    a     wall back to the wall."""
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
@@ -282,8 +267,7 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number the connected bodies of fluid. Return the number of the body for each surface point (p,) and each particle
-    (n,). The number is -1 outside all bodies."""
+    """Return body numbers of surface points (p,) and particles (n,), or -1 outside all bodies of fluid."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -311,9 +295,7 @@ def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
 
 
 def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Mesh:
-    """Make the surface of the fluid in the axes of the scene, for particles at positions (n, 3) [m] with colours (n,
-    3). The surface ends at walls and encloses the volume of the particles. Raises `ComputationError` without a surface.
-    """
+    """Positions (n, 3) [m] and the mesh are in scene axes. Raises `ComputationError` without a surface."""
     launch, stage = BandLauncher(wp.get_device(device)), replace(stage, solids=())
     with WARP:
         own = particles_of(stage, positions, colours, launch)

@@ -39,11 +39,10 @@ from cortado.version import __version__
 Computed = Callable[[], Simulation] | None
 """A function that makes the simulation for colours that were not recorded."""
 Around = tuple[tuple[int, ...], tuple[int, ...]]
-"""Numbers of the frames before and after a frame, the nearest first."""
+"""Frame numbers before and after a frame, each sorted from the nearest number."""
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
-"""A function that draws frame number k as a linear picture (rows, columns, 3) from 0 to 1. The second argument has the
-numbers of the frames before and after k."""
+"""A function that draws a frame as a linear picture (rows, columns, 3) from 0 to 1."""
 LEAST_PIXELS = 64
 SLOW = 0.1
 """Speed of a film below which fluid at rest is not averaged over frames [simulated seconds per second]."""
@@ -61,7 +60,7 @@ class Page:
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
     def images(self, frames: Sequence[int], begin: int = 0, window: int = WINDOW) -> Iterator[Points]:
-        """Yield the pictures of a film's frames from ``begin`` on. A thread draws the next picture in advance."""
+        """A thread draws the next picture in advance."""
         shown, count = range(begin, len(frames)), len(self.panels)
         drawn = _ahead(count, (panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels))
         return (self.composed(list(islice(drawn, count))) for _ in shown)
@@ -91,12 +90,8 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Fit several stages into one page with a common scale and region. The page has the picture size of the first stage
-    minus ``spare`` columns. Return the stages and the number of pictures in a row.
-
-    Raises:
-        InputError: the pictures would be too small.
-    """
+    """Return stages with a common scale that fit into one page, and the number of pictures in a row. ``spare`` columns
+    of     the page stay free. Raises `InputError` if the pictures would be too small."""
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
@@ -113,7 +108,7 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """Choose how many of ``count`` pictures are in a row, so that contents of width and height ``size`` are large."""
+    """Return the number of pictures in a row that shows contents of width and height ``size`` largest."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -131,7 +126,7 @@ def lacking(scene: Scene) -> str | None:
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """Write a film of the frames that ``pace`` chooses. After an interruption, a second call continues the film."""
+    """After an interruption, a second call continues the film."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -145,7 +140,7 @@ def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
 
 
 def _ahead(count: int, images: Iterator[Points]) -> Iterator[Points]:
-    """Yield images in order. Up to ``count`` further images are drawn in advance in a thread."""
+    """Draw up to ``count`` further images in advance in a thread."""
     painter = ThreadPoolExecutor(1, thread_name_prefix="cortado-film")
     try:
         coming = deque(painter.submit(next, images, None) for _ in range(count))
@@ -219,8 +214,8 @@ class ShownRun:
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles that have left emitters and are not in a drain. If the scene starts without
-    fluid, the first layers of emitters are included. ``others`` are the fields of `Frame.others`."""
+    """Return a mask (n,) of the particles outside emitters and drains. Without fluid, the first layers of emitters
+    count as     outside, so that a picture is not empty. ``others`` are the fields of `Frame.others`."""
     found = ~waits(scene, others, particles)
     for _, first, sample in () if found.any() else samples(scene, particles):
         found[first : first + sample.layer] = True
@@ -228,8 +223,7 @@ def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[n
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the positions of particles in pictures (frames, n, d) [m]. Particles that wait in an emitter are at its
-    opening, and particles in a drain are at its middle."""
+    """Return positions (frames, n, d) [m], with waiting particles at the opening of their emitter."""
     places, others, count = trajectory.positions, trajectory.others, trajectory.particles
     out = np.array([is_out(scene, frame.others, count) for frame in (trajectory if scene.emitter else ())])
     for name, first, sample in samples(scene, count):
@@ -242,13 +236,12 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """Convert a mask (n,) to an index of arrays (n, ...). A mask that is True everywhere becomes a slice."""
+    """Convert a mask (n,) to an index. A mask that is True everywhere becomes a slice, which copies nothing."""
     return slice(None) if out.all() else out
 
 
 def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return the times (frames, n) [s] since particles left an emitter. Particles from the start of the run have the
-    time since the start, and particles still in an emitter have 0."""
+    """Return the times (frames, n) [s] since particles left an emitter, or since the start of the run."""
     since, count = np.full(trajectory.positions.shape[:2], float(trajectory.times[0])), trajectory.particles
     for name, first, sample in samples(scene, count):
         if emitted_name(name) in trajectory.others:
@@ -259,12 +252,8 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Computed = None) -> NDArray | None:
-    """Return the values (frames, n) that determine the colours of particles. Return None if particles have the colours
-    of their phases.
-
-    Raises:
-        InputError: the quantity was not recorded and cannot be computed.
-    """
+    """Return values (frames, n) for a colour scale, or None for the colours of phases. Raises `InputError` for a
+    quantity     that was not recorded and cannot be computed."""
     name = (scene.picture or Picture()).colour
     if name == "phase":
         return None

@@ -103,8 +103,7 @@ def read_picture(path: str | Path, resolution: Resolution | None = None) -> Pict
 
 
 def resized(picture: Any, resolution: tuple[int, int]) -> Picture:
-    """Resample the largest central part of a Pillow picture that has the aspect ratio of ``resolution``, in linear
-    light."""
+    """Crop a Pillow picture to the aspect ratio of ``resolution``, and resample the picture in linear light."""
     from PIL import Image
 
     if resolution == picture.size:
@@ -146,8 +145,7 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Warn if a picture of ``size`` must be cropped to the aspect ratio of ``shape``. The warning begins with the text
-    ``found``."""
+    """Warn if the aspect ratio of ``shape`` needs less than 99 % of a picture of ``size``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < 0.99:

@@ -1,8 +1,4 @@
-"""HTML for notebooks and run folders.
-
-Notebooks show an object as its repr, followed by a picture, a film, an animation or a table. The report.html of a run
-folder embeds pictures and films, and opens from disk without a network.
-"""
+"""HTML for objects in notebooks, and the report.html of a run folder, which opens without a network."""
 
 from __future__ import annotations
 
@@ -43,7 +39,7 @@ _KINDS = {
 WIDE = ' style="width: 100%"'
 AGAIN, LATER = "<h2>How to run it again</h2>", "<h2>Drawn later</h2>"
 MOST_NUMBERS = 6
-"""Greatest number of values of a parameter in the table. For larger parameters the table shows the range."""
+"""Greatest number of values of a parameter in the table."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +54,11 @@ class Section:
     view: str = ""
     head: Sequence[str] = ()
     rows: Sequence[Sequence[object]] = ()
-    """Rows of a table. The first entry of each row is its name."""
+    """Rows of a table, each with its name as the first cell."""
 
 
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
-    """Write the report of a run and return its path. The page ends with the run's command, scene and environment.
-    Raises `InputError` for a picture that cannot be embedded or a page that cannot be written."""
+    """Raises `InputError` if a picture cannot be embedded or the page cannot be written."""
     again = "<p>The command is not known.</p>"
     with suppress(OSError, ValueError, KeyError):
         noted = json.loads(folder.environment.read_text(encoding="utf-8"))
@@ -99,7 +94,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 
 
 def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
-    """Add a new picture or film to the report of a run. Nothing happens if the run has no report."""
+    """Do nothing if the run has no report."""
     page = folder.report.read_text(encoding="utf-8") if folder.report.exists() else ""
     before, again, after = page.partition(AGAIN)
     if again:
@@ -110,7 +105,7 @@ def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
 
 
 def written(value: Any) -> str:
-    """Return a few numbers as text. For many numbers, return their count and range."""
+    """Format numbers as text. More than 12 numbers become their count and range."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         return str(value)
@@ -176,7 +171,6 @@ def simulation_page(simulation: Simulation) -> str:
 
 
 def trajectory_page(run: Trajectory) -> str:
-    """Return HTML of a trajectory: its repr, an animation, and pictures of 3 frames, coloured by speed."""
     if not len(run):
         return f"<pre>{escape(repr(run))}</pre>"
     domain = WITHOUT_PERIODS if run.scene is None else run.scene.container.domain(run.dimension)
@@ -199,8 +193,6 @@ def film_page(film: Film) -> str:
 
 
 def result_page(found: object, message: str, problem: Any, start: Values, best: Values, losses: Any) -> str:
-    """Return HTML of the result of a search. For a `Problem`, the page shows the runs with the first and best
-    parameters."""
     if hasattr(problem, "coordinates"):
         problem, (start, best) = problem.problem, [problem.parameters(u) for u in (start, best)]
     is_ours = isinstance(problem, Problem) and problem.simulation.batch is None
@@ -242,7 +234,7 @@ def as_words(found: object) -> str:
 
 
 def picture(found: object, draw: Callable[[Path], Any]) -> str:
-    """Return HTML of the PNG that ``draw`` writes to a path, or an empty text if a drawing package is missing."""
+    """Return an empty text if a drawing package is missing."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         try:

@@ -35,28 +35,24 @@ MOVING = np.array([0.75, 0.20, 0.02])
 def painter(
     scene: Scene, positions: Points | Sequence[Points], device: Any = "cpu", poses: Iterable[Scene] = ()
 ) -> PlanePainter | SpacePainter:
-    """Return the painter of a scene. The arguments are as in `stage_of`, and rays are traced on ``device``."""
     stage = stage_of(scene, positions, poses)
     return PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return the surroundings of the fluid at positions (n, d) or (frames, n, d) [m]. Solids are also shown at later
-    ``poses``."""
+    """Positions are (n, d) or (frames, n, d) [m]. The stage has room for the solids at all ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Return the linear colour (n, 3) of each particle, mixed from the colours (phases, 3) of its phases. By default
-    the colours of phases are those of the scene."""
+    """Return linear colours (n, 3), mixed from the ``colours`` (phases, 3) of phases or of the scene."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
 
 
 def plan(scene: Scene, positions: Points, colours: Points, device: Any = "cpu") -> Points:
-    """Draw a linear picture (rows, columns, 3) of a scene before a run, with paths, arrows and sizes. Particles are
-    spheres at ``positions`` (n, d) [m] with linear colours (n, 3)."""
+    """Draw a scene before a run, with spheres at ``positions`` (n, d) [m] of linear ``colours`` (n, 3)."""
     look = (scene.picture or Picture()).model_copy(update={"surface": "spheres", "colour": "phase"})
     scene, spacing = scene.model_copy(update={"picture": look}), scene.discretisation.spacing
     paths, poses = list[Points](), list[Scene]()
@@ -139,7 +135,7 @@ def length_of(text: str, size: int) -> float:
 
 @lru_cache(maxsize=32)
 def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
-    """Return the part of a picture that contains texts, and the opacity of each pixel of this part."""
+    """Return the region of a picture that contains texts, and the opacity of its pixels."""
     from PIL import Image, ImageDraw
 
     mask = Image.new("L", shape[::-1])
@@ -151,8 +147,7 @@ def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tupl
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
-    """Draw lines through points (k, 2), given as column and row, on a linear picture (rows, columns, 3). ``colour``
-    (3,) is linear, and ``width`` is in pixels."""
+    """Draw lines through points (k, 2), column and row, on a linear picture. ``width`` is in pixels."""
     from PIL import Image, ImageDraw
 
     rows, columns = image.shape[:2]
@@ -165,7 +160,7 @@ def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) ->
 
 
 def side_by_side(images: Sequence[Points], across: int, names: Sequence[str] = ()) -> Points:
-    """Arrange pictures of one size in rows of ``across`` pictures, with thin lines between them, and label them."""
+    """All pictures must have the same size."""
     rows, columns = images[0].shape[:2]
     down = -(-len(images) // across)
     page = np.ones((down * rows, across * columns, 3), images[0].dtype)
@@ -197,8 +192,7 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """Make the colour scale for ``values``, such as all values in a film. Give the ``unit`` if only some scenes
-        have the quantity."""
+        """Give the ``unit`` of a quantity that is not in `UNITS`."""
         least, greatest = np.percentile(values, (0.5, 99.5))
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 
@@ -206,7 +200,7 @@ class Scale:
         return _colours(np.clip((values - self.least) / (self.greatest - self.least or 1.0), 0.0, 1.0))
 
     def columns(self, rows: int) -> int:
-        """Return the width of the scale in pixels for a picture with ``rows`` rows."""
+        """Return the width of the scale in pixels."""
         size = max(round(0.026 * rows), 9)  # of letters
         return ceil(max(self._wide(size), *(length_of(text, size) for text in self._heads))) + size
 
@@ -217,7 +211,7 @@ class Scale:
         return self.on(np.concatenate([image, np.repeat(smooth[:, None], self.columns(rows), axis=1)], axis=1))
 
     def on(self, image: Points) -> Points:
-        """Return a picture (rows, columns, 3) with the scale over its right edge, the greatest value at the top."""
+        """Draw the scale over the right edge of a picture (rows, columns, 3)."""
         rows, columns = image.shape[:2]
         size = max(round(0.026 * rows), 9)  # of letters
         top, bottom, right = round(0.34 * rows), round(0.70 * rows), columns - size // 2

@@ -1,5 +1,4 @@
-"""An animation of particles as a part of an HTML page. The animation plays from a file, without a server or a
-network."""
+"""An animation of particles as a part of an HTML page, which plays without a server or a network."""
 
 from __future__ import annotations
 
@@ -37,24 +36,18 @@ class Cloud:
 
 
 def style() -> str:
-    """Return the CSS of all animations of a page."""
     return Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 
 def script() -> str:
-    """Return the script that runs all animations of a page. The script must appear once in the page, after the
-    animations."""
+    """The script must appear once in a page, after all animations."""
     source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
     return f"<script>\n{source}</script>"
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = 2_200_000) -> tuple[NDArray[np.intp], int]:
-    """Choose frames and a stride of particles, so that an animation needs at most ``most_bytes``.
-
-    Args:
-        numbers: bytes per particle and frame, summed over all clouds: two for each component of the position, one for
-            the speed, three for a changing colour.
-    """
+    """Return frame numbers and a stride of particles, so that an animation needs at most ``most_bytes``. ``numbers``
+    are the     bytes of one particle in one frame."""
     count = min(frames, 120, max(most_bytes // (numbers * particles), 24))  # 24 to 120 of them
     stride = max(-(-count * numbers * particles // most_bytes), 1)
     return np.unique(np.linspace(0, frames - 1, count).astype(int)), stride
@@ -63,15 +56,9 @@ def thinned(frames: int, particles: int, numbers: int, most_bytes: int = 2_200_0
 def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
-    """Return HTML that shows clouds of particles side by side with the y axis up. All clouds are rotated together.
-
-    Args:
-        clouds: clouds with the same frames and the same number of particles.
-        times: (frames,) [s].
-        spacing: distance between particles at rest [m].
-        lines: (k, 2, d) end points of lines [m], such as the edges of a container.
-        stride: the clouds contain every ``stride``-th particle (`thinned`).
-    """
+    """Return HTML that shows clouds of the same size side by side, with the y axis up. ``times`` (frames,) are in
+    seconds,     and ``lines`` (k, 2, d) are end points [m]. The clouds contain every ``stride``-th particle of
+    particles with the     distance ``spacing`` [m] at rest."""
     times, (_, particles, dimension) = np.asarray(times, dtype=float), clouds[0].positions.shape
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
     shown = np.concatenate([array.reshape(-1, dimension) for array in (*(cloud.positions for cloud in clouds), ends)])

@@ -27,15 +27,8 @@ SUPPORT = 1.3
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
-    """Return the colours (rows, columns, 3) of a shape with glossy shading, so that its middle looks thicker than its
-    edge.
-
-    Args:
-        cover: fraction of each pixel that the shape covers (rows, columns).
-        colour: linear colours (rows, columns, 3) or (3,).
-        width: width of the edge in pixels.
-        gleaming: brightness of the lamp's reflection.
-    """
+    """Return shaded colours (rows, columns, 3). ``cover`` (rows, columns) is the covered fraction of each pixel. The
+    edge of     the shape is ``width`` pixels wide."""
     from scipy.ndimage import gaussian_filter
 
     height = gaussian_filter(cover, width)
@@ -60,14 +53,13 @@ class PlaneStage:
     picture: Picture
     container: BoxContainer | None
     lower: Points
-    """Lower corner (2,) [m] of the container, or of the fluid and the solids if there is no container."""
+    """Lower corner (2,) [m] of the container, or of fluid and solids without a container."""
     upper: Points
-    """Upper corner (2,) [m] of the container, or of the fluid and the solids if there is no container."""
     spacing: float
     """Particle spacing [m]."""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
-    """Lower and upper corner (2,) [m] of the shown region. The default is the region from `lower` to `upper`."""
+    """Lower and upper corner (2,) [m] of the shown region, by default `lower` and `upper`."""
 
     @classmethod
     def of(cls, scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> "PlaneStage":
@@ -126,8 +118,7 @@ class PlaneStage:
 
     @cached_property
     def behind(self) -> Points:
-        """Colours (rows, columns, 3) of the picture behind the fluid: paper with shadows, and the inside of the
-        container."""
+        """Colours (rows, columns, 3) of paper, shadows and the inside of the container."""
         (x, y), middle, half = self.pixels, self.middle, 0.5 * self.pixel * self.picture.width
         away = ((x - middle[0]) ** 2 + (y - middle[1] - 0.2 * half) ** 2) / half**2
         paper = np.asarray(self.picture.sun_and_sky.background) * (1.12 - 0.20 * away)[..., None]
@@ -191,7 +182,7 @@ class PlaneStage:
         return [(one, self._distance(one)) for one in self.solids if one.is_tank]
 
     def _distance(self, shown: ShownSolid, drop: float = 0.0) -> Points:
-        """Return the signed distance from a solid (rows, columns) [m], < 0 inside, ``drop`` [m] above each pixel."""
+        """Return signed distances (rows, columns) [m] from a solid, measured ``drop`` [m] above the pixels."""
         (x, y), (lower, upper), margin = self.pixels, shown.body.extent(), AROUND * self._size
         columns = np.flatnonzero((x[0] > lower[0] - margin) & (x[0] < upper[0] + margin))
         rows = np.flatnonzero((y[:, 0] + drop > lower[1] - margin) & (y[:, 0] + drop < upper[1] + margin))
@@ -224,7 +215,7 @@ class PlaneStage:
         return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
-        """Return the layer of walls. ``distance`` is the distance of the pixels from the inner side [m]."""
+        """``distance`` [m] is the distance of the pixels from the inner side of the walls."""
         wall = 0.01 * self._size
         band = np.clip(distance / self.pixel + 0.5, 0.0, 1.0) * np.clip((wall - distance) / self.pixel + 0.5, 0.0, 1.0)
         shine = 1.0 - 0.35 * np.clip(distance / wall, 0.0, 1.0)
@@ -251,7 +242,7 @@ class PlanePainter:
         return np.clip(image, 0.0, 1.0)
 
     def _fluid(self, positions: Points, colours: Points) -> tuple[Points, Points]:
-        """Return the opacity of the fluid (rows, columns), and its colours (rows, columns, 3)."""
+        """Return the opacity (rows, columns) and the colours (rows, columns, 3) of the fluid."""
         from scipy.ndimage import map_coordinates
         from scipy.spatial import cKDTree
 
@@ -283,7 +274,7 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Return positions (n, 2) of particles and of their images, and the particle number of each position."""
+        """Return positions (m, 2) of particles and their images, and the particle number of each position."""
         stage, of, reach = self.stage, np.arange(len(positions)), 0.9 * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)
@@ -308,7 +299,7 @@ def _weight(distances: Points, reach: float) -> Points:
 def _splat(
     positions: Points, strength: Points, colours: Points, corner: Points, cell: float, counts: np.ndarray, reach: float
 ) -> tuple[Points, Points]:
-    """Return the sum of the fields at nodes (nx, ny), and the mean colour of near particles (3, nx, ny)."""
+    """Return the density of fluid at nodes (nx, ny), and the mean colour of near particles (3, nx, ny)."""
     patch = np.arange(-int(reach / cell) - 1, int(reach / cell) + 2)
     nearest = np.rint((positions - corner) / cell).astype(int)
     size = int(np.prod(counts))

@@ -32,8 +32,7 @@ STYLE: dict[str, Any] = {
 
 @contextmanager
 def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
-    """Create a figure with a ``width`` and ``height`` in inches, for use in a ``with`` block. The figure is saved at
-    ``path`` if the block ends without an error."""
+    """Sizes are in inches. The figure is saved if the ``with`` block ends without an error."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -56,8 +55,7 @@ def whole_numbers(axis: Any) -> None:
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
-    """Plot losses (evaluations,) against the number of the evaluation. The axis of losses is logarithmic if any loss is
-    positive."""
+    """The axis of losses is logarithmic if any loss is positive."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
     logarithmic = bool(np.any(values[shown] > 0.0))
@@ -91,8 +89,7 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot each component of ``found`` (k, c) against ``x`` (k,) in its own panel. The curves ``true`` and ``start``
-    are constants (c,) or arrays (k, c)."""
+    """Plot ``found`` (k, c) against ``x`` (k,). The curves ``true`` and ``start`` are (c,) or (k, c)."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
     with drawing(path, height=1.6 + 1.9 * count) as figure:
@@ -114,7 +111,7 @@ def panels(
 
 
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path) -> Path:
-    """Plot images with linear colours (rows, columns, 3) side by side. More than four images form a grid."""
+    """Images are linear colours (rows, columns, 3). More than four images form a grid."""
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
         raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
@@ -143,20 +140,10 @@ def particles(
     container: tuple[ArrayLike, ArrayLike] | None = None,
     lines: Sequence[ArrayLike] | None = None,
 ) -> Path:
-    """Plot particle sets side by side, such as before, after and target.
-
-    In 3-D the view is along the z axis, with x to the right and y upwards. Particles with larger z are nearer and cover
-    farther particles. Above 150 000 particles, only every k-th particle is drawn.
-
-    Args:
-        positions: one array (n, d) [m] for each panel.
-        colours: for each panel, linear colours (n, 3) from 0 to 1, or numbers (n,) on a colour scale. All panels share
-            the colour scale. None shades particles by depth.
-        colour_label: label of the colour scale, with its unit.
-        container: lower and upper corner (d,) [m] of the container, whose outline is drawn.
-        lines: for each panel, end points (k, 2, d) [m] of k lines, such as outlines of solids. The lines are drawn over
-            the particles.
-    """
+    """Plot particle sets (n, d) [m] side by side. In 3-D the view is along the z axis, with y upwards.      ``colours``
+    are linear colours (n, 3), or numbers (n,) on a scale that all panels share. Without colours, particles are
+    shaded by depth. ``container`` has two corners (d,) [m], and ``lines`` are end points (k, 2, d) [m] for each panel.
+    Above 150 000 particles, only every k-th particle is drawn."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 
@@ -199,8 +186,7 @@ def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -
 
 
 def _colour_scale(sets: list[Points], colours: Sequence[NDArray | None]) -> tuple[list[NDArray], Any, str]:
-    """Return red, green and blue of the points of each panel (n, 3), from 0 to 1. Points without colours are shaded by
-    depth. Also return the scale of numbers, or None, and the end at which it clips."""
+    """Return colours (n, 3) of each panel, the scale of numbers or None, and the end at which the scale clips."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -238,8 +224,7 @@ def _draw_set(axes: Any, points: NDArray[Any], colours: NDArray[Any], title: str
 
 
 def spacing_of(points: NDArray[Any], otherwise: float = 0.02) -> float:
-    """Return the median distance between a point and its nearest neighbour [m]. For a single point, return
-    ``otherwise``."""
+    """Return the median distance to the nearest neighbour [m], or ``otherwise`` for a single point."""
     from scipy.spatial import cKDTree
 
     if len(points) < 2:

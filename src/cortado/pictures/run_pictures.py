@@ -45,8 +45,7 @@ Given = Scene | str | Path | None
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Draw the first and the last state of a run, a contact sheet and a film into a folder. Return captions and paths.
-    The contact sheet and the film have the quality "quick", unless the scene sets another quality."""
+    """Return captions and paths. Film and contact sheet are "quick" unless the scene sets a quality."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -90,8 +89,7 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 def shown_run(
     trajectory: Trajectory, scene: Scene, settings: Settings, units: Any = None, simulation: Computed = None
 ) -> ShownRun:
-    """Return a run for pictures. ``settings`` replace keys of the scene's table [picture], and ``simulation`` computes
-    quantities for colours that were not recorded."""
+    """``simulation`` computes quantities for colours that were not recorded."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units
@@ -168,8 +166,8 @@ def _units_of_fields(simulation: Simulation) -> dict[str, str]:
 
 
 def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> Scene:
-    """Return the scene with keys of its table [picture] replaced by ``settings``. The key ``colour`` may also name one
-    of the recorded ``fields``. Raises `SceneError` for invalid settings."""
+    """Return the scene with ``settings`` in its table [picture]. ``colour`` may name one of the recorded ``fields``.
+    Raises     `SceneError` for invalid settings."""
     given = {} if scene.picture is None else scene.picture.model_dump()
     wanted = {**given, **settings}
     if "lines" in settings:
@@ -191,8 +189,7 @@ def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot the density error [%] and the iterations of each solver loop against the time step. Steps without
-    convergence are marked."""
+    """Plot the density error [%] and the iterations of each solver loop, and mark steps without convergence."""
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors
@@ -221,7 +218,7 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
-    """Plot the readings of sensors over time. Each number of a sensor has a curve, and each unit has a panel."""
+    """Plot the readings of sensors over time, with a panel for each unit."""
     lines = dict[str, list[tuple[str, Readings, str]]]()
     for name, own in found.items():
         for column, unit in own.units.items():
@@ -245,7 +242,7 @@ def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
-    """Plot a panel for each measured quantity: the measured points, the curve of the sensor, and the error."""
+    """Plot a panel for each measured quantity, with the points, the curve of the sensor and the error."""
     with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")
@@ -262,7 +259,6 @@ if TYPE_CHECKING:
 
 
 def gradient_check(certificate: Certificate, path: str | Path) -> Path:
-    """Plot the results of a gradient check: central differences, growth of the adjoint, horizon, and estimators."""
     with drawing(path, 12.0, 8.4) as figure:
         (differences, growth), (horizon, estimators) = figure.subplots(2, 2)
         _differences(differences, certificate)

@@ -84,8 +84,7 @@ def film_side_by_side(
 
 
 def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
-    """Return all scenes with the table [picture] of the first scene. Raises `InputError` for runs that do not fit
-    together, such as 2-D and 3-D runs."""
+    """Return scenes with the same table [picture]. Raises `InputError` for runs that do not fit together."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -101,8 +100,7 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Return a picture page of several runs, labelled with name and time, and the times of its frames [s]. Prepare the
-    scenes with `shown_alike`."""
+    """Return a page of runs, and the times of its frames [s]. Prepare the scenes with `shown_alike`."""
     times = common_times([run.times for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -134,8 +132,7 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] for a film of several runs. The time between frames is the interval of the run
-    with the most frames."""
+    """Return the times (frames,) [s] of a film. The frame interval is the shortest interval of all runs."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -154,7 +151,7 @@ def interval_of(times: NDArray[Any]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ShownFrames:
-    """The recorded frames of one run for a film. Each time of the film shows the nearest recorded frame."""
+    """The recorded frames that a film shows for one run."""
 
     own: NDArray[Any]
     """Times of the recorded frames [s]."""
@@ -185,11 +182,8 @@ class ShownFrames:
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """Return a label for each scene. The labels are the names of the scenes if all names differ.
-
-    Otherwise the labels are made of the values that differ between the scenes, such as ``viscosity = 0.1 Pa s``. Return
-    ``otherwise`` if no values or too many values differ.
-    """
+    """Return the names of the scenes, or the values that differ, such as ``viscosity = 0.1 Pa s``. If neither tells the
+    scenes apart, return ``otherwise``."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]

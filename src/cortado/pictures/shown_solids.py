@@ -20,8 +20,7 @@ FAR = 1e9
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """Merge coincident vertices and remove triangles without area. Return the vertices, the remaining triangles, and a
-    mask of the remaining triangles."""
+    """Remove triangles without area. Also return a mask (t,) of the remaining triangles."""
     whole = np.rint((vertices - vertices.min(axis=0)) / (1e-9 * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
@@ -35,7 +34,7 @@ def sides_of(corners: Numbers) -> Numbers:
 
 
 def across_of(vertices: Points, corners: Numbers) -> Points:
-    """Return an outward normal of each triangle. The length of the normal is twice the triangle's area [m2]."""
+    """Return outward normals (t, 3). The length of a normal is twice the area of the triangle [m2]."""
     a, b, c = vertices[corners].transpose(1, 0, 2)
     return np.asarray(np.cross(b - a, c - a))
 
@@ -46,8 +45,8 @@ def unit(vectors: NDArray[Any]) -> Points:
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
-    """Return cosines (t, 3) of the angles between the normals of adjacent triangles. Each side of a triangle has the
-    index of its opposite corner. The cosine is -1 for sides without exactly one adjacent triangle."""
+    """Return cosines (t, 3) of the angles between normals of adjacent triangles. Side k is opposite to corner k. The
+    cosine     is -1 for sides without exactly one adjacent triangle."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -86,13 +85,12 @@ class ShownSolid:
         return Hollow(self.body) if self.is_tank else self.body
 
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """Convert the solid to coordinates with the rotation matrix ``frame`` (d, d) and the ``origin`` (d,) [m]."""
+        """Convert the solid to axes with the rotation matrix ``frame`` (d, d) and the ``origin`` (d,) [m]."""
         return replace(self, position=frame @ (self.position - origin), turn=frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Return the solids of a scene, including periodic images. Solids outside the periodic box are moved into
-    the box."""
+    """Include periodic images. Solids outside the periodic box are moved into the box."""
     found, domain = [], scene.domain
     for table in scene.solid:
         shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
@@ -128,14 +126,13 @@ def solid_outline(scene: Scene) -> Points:
 
 
 def own_faces(shown: ShownSolid) -> Faces:
-    """Return the faces of a solid with its middle at the origin, without rotation."""
+    """The middle of the solid is at the origin, and the solid is not rotated."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
     return shown.shape.shown_faces(np.pi / 48 * float(max(sizes.min(), 0.25 * sizes.max())))
 
 
 def own_lines(shown: ShownSolid) -> Points:
-    """Return the outline of a solid as line segments (k, 2, d) [m]. The solid's middle is at the origin, without
-    rotation."""
+    """Return line segments (k, 2, d) [m]. The middle of the solid is at the origin."""
     faces = own_faces(shown)
     if len(shown.turn) == 2:
         return faces.vertices[faces.corners]
@@ -158,13 +155,9 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Cut triangles (t, 3) with vertices (v, 3) [m] into smaller triangles. Return the new vertices, the new triangles,
-    and the index of the original triangle for each new triangle.
-
-    Each side is cut into equal parts no longer than ``longest`` [m]. The number of parts is the least possible power of
-    2, so adjacent triangles still share their vertices. New sides inside a triangle are at most sqrt(2) times as long
-    as ``longest``.
-    """
+    """Cut the sides of triangles (t, 3) into parts of at most ``longest`` [m]. Also return the index of the original
+    triangle of each new triangle.      The number of parts is a power of 2, so adjacent triangles still share their
+    vertices. New sides inside a triangle     are at most sqrt(2) times as long as ``longest``."""
 
     def parts_of(sides: Numbers) -> Numbers:
         lengths = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1)
@@ -196,7 +189,7 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
 
 
 def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
-    """Cut triangles (t, 3) at ``middles`` (t, 3), new vertices on the sides opposite to each corner, or -1."""
+    """``middles`` (t, 3) are new vertices on the sides opposite to each corner, or -1."""
     count, found, own = (middles >= 0).sum(axis=1), [], []
 
     def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
@@ -287,7 +280,7 @@ class SolidMesh:
 
 
 def _normals(corners: Numbers, across: Points) -> Points:
-    """Return the mean normal of the triangles around each corner (t, 3, 3), without those beyond sharp edges."""
+    """Return mean normals (t, 3, 3) at corners, over the triangles that are not beyond a sharp edge."""
     order = np.argsort(corners.ravel(), kind="stable")
     counts = np.bincount(corners.ravel())
     ends = np.cumsum(counts)

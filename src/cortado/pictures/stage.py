@@ -25,20 +25,15 @@ SPAN = 0.1
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:
-    """Return a sample of the particle positions in each state, as arrays (m, d) [m] inside the periodic box.
-    ``positions`` is one state (n, d) [m] or several."""
+    """Return a sample of positions (m, d) [m] for each state, inside the periodic box."""
     states = [positions] if isinstance(positions, np.ndarray) and positions.ndim == 2 else list(positions)
     stride = max(sum(map(len, states)) // ENOUGH, 1)
     return [domain.wrapped(state[k % min(stride, len(state) or 1) :: stride]) for k, state in enumerate(states)]
 
 
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return the lower and the upper corner (d,) [m] of the region that shows the fluid. ``states`` are arrays of
-    positions (n, d) [m].
-
-    The region contains all fluid of the first state. From later states it contains the bulk, and drops near the first
-    state or near the boxes ``around``. Drops that fall far away do not make the fluid look smaller.
-    """
+    """Return the lower and the upper corner (d,) [m] of the region that shows the fluid. Drops that fall far away do
+    not     make the fluid look smaller."""
     first, *later = states
     found = [_ends(first, DROPS)]
     lower, upper = union([*found, *around])
@@ -53,19 +48,14 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return the corners (d,) [m] of positions (n, d) [m], without the outermost ``share`` along each axis."""
+    """Return the corners (d,) [m] of positions without the outermost ``share`` along each axis."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """Return the scattering and absorption coefficients of each phase (phases, 2) [1/m], and the transparency. The
-    transparency is the mean fraction of light that passes through a layer of fluid. The layer's thickness is `SPAN`
-    times ``size`` [m].
-
-    The material of each phase determines its coefficients. If the picture sets a transparency, or does not show the
-    colours of phases, the transparency determines the coefficients.
-    """
+    """Return scattering and absorption of each phase (phases, 2) [1/m], and the transparency. The transparency is the
+    mean     fraction of light that passes through fluid of the thickness `SPAN` times ``size`` [m]."""
     picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
     by_phase, transparency = picture.colour == "phase", picture.transparency
     own = by_phase and transparency is None and picture.surface == "liquid"
@@ -88,8 +78,7 @@ def media_of(scene: Scene, size: float) -> tuple[Points, float]:
 
 @dataclass(frozen=True)
 class Stage:
-    """Everything in a 3-D picture except the fluid, in picture axes. The picture's y axis points up, and its origin is
-    in the middle of the container or of the fluid."""
+    """Everything in a 3-D picture except the fluid. The y axis of a picture points up."""
 
     frame: Points
     """Rotation matrix (3, 3) from scene axes to picture axes."""
@@ -98,7 +87,6 @@ class Stage:
     lower: Points
     """Lower corner (3,) [m] of a box around the fluid and the container, in picture axes."""
     upper: Points
-    """Upper corner (3,) [m] of a box around the fluid and the container, in picture axes."""
     seen: tuple[Points, Points]
     """Lower and upper corner (3,) [m] of the region that the camera shows, in picture axes."""
     elevation: float
@@ -149,8 +137,7 @@ class Stage:
         return own.framed((lower, upper), picture).at(scene, None)
 
     def framed(self, ends: tuple[Points, Points], picture: Picture) -> "Stage":
-        """Return the stage with a camera for a new picture. The camera shows the box between the corners ``ends`` (3,)
-        [m], given in scene axes."""
+        """Return the stage with a camera that shows the box ``ends`` (3,) [m], given in scene axes."""
         lower, upper = _box((corners(*ends) - self.origin) @ self.frame.T)
         eye, look_at = fitted(lower, upper, self.elevation, picture)
         if picture.look_at is not None:
@@ -177,8 +164,7 @@ class Stage:
 
     @property
     def home_around(self) -> View:
-        """First view of a camera that circles the scene. If the table [picture] has no camera, the camera is far enough
-        away to show everything from every side."""
+        """First view of a circling camera. Everything is visible from every side, unless a camera is given."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -189,8 +175,7 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """Return the stage with the solids of the scene ``pose`` and the camera at ``view``. If an argument is None,
-        the solids or the camera are unchanged."""
+        """Return the stage with the solids of ``pose`` and the camera at ``view``. An argument None changes nothing."""
         found = self
         if pose is not None:
             solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
@@ -215,8 +200,7 @@ class Stage:
         return (positions - self.origin) @ self.frame.T
 
     def on_screen(self, points: Points) -> Points:
-        """Convert points (n, 3) [m] in scene axes to pixel coordinates (n, 2): column and row, counted from the upper
-        left corner."""
+        """Convert points (n, 3) [m] in scene axes to pixel coordinates (n, 2), column and row."""
         forward = self.look_at - self.eye
         forward = forward / np.linalg.norm(forward)
         off = self.placed(points) - self.eye
@@ -230,8 +214,7 @@ class Stage:
 
     @property
     def glass_frame(self) -> Points:
-        """Rotation matrix (3, 3) from picture axes to container axes. The second container axis is the axis of a
-        cylindrical container."""
+        """Rotation matrix (3, 3) from picture axes to container axes. Container axis 1 is the axis of a cylinder."""
         if not isinstance(self.container, CylinderContainer):
             return np.eye(3)
         axis = INDEX_OF_AXIS[self.container.axis]
@@ -245,9 +228,8 @@ class Stage:
 
     @property
     def room(self) -> tuple[Points, Points]:
-        """Lower and upper corner (3,) [m] of the region in which fluid is shown, in container axes. The region is
-        infinite along periodic axes. The region is also infinite upwards, because emitters may be above the container.
-        """
+        """Corners (3,) [m] of the region in which fluid is shown, in container axes. The region is infinite along
+        periodic axes,         and upwards because emitters may be above the container."""
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
         axis = int(np.abs(up).argmax())
@@ -260,8 +242,7 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """Mask (2, 3) of the container's sides that are panes of glass. The first index is 0 for lower and 1 for upper
-        sides, and the second index is the axis."""
+        """Mask (2, 3) of panes of glass, for lower and upper sides (rows) along each axis (columns)."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)
@@ -293,8 +274,8 @@ def spilled(container: Container, positions: Points, spacing: float) -> bool:
 
 
 def upright(gravity: Points) -> Points:
-    """Return the rotation matrix (3, 3) from scene axes to picture axes, which point right, up, and towards the viewer.
-    The direction up is opposite to gravity (3,), or along y without gravity."""
+    """Return the rotation matrix (3, 3) from scene axes to picture axes. The picture axes point right, up (against
+    ``gravity`` (3,), or along y) and towards the viewer."""
     axis = int(np.abs(gravity).argmax()) if gravity.any() else 1
     up, towards = np.zeros(3), np.zeros(3)
     up[axis] = -1.0 if gravity[axis] > 0.0 else 1.0
@@ -308,8 +289,7 @@ def _towards(azimuth: float, elevation: float) -> Points:
 
 
 def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azimuth: float = 24.0) -> Box:
-    """Return a camera position (3,) [m] and the point (3,) [m] at which the camera looks. The box from ``lower`` to
-    ``upper`` (3,) [m] then fills the picture."""
+    """Return a camera position (3,) [m] and a look-at point (3,) [m] for which the box fills the picture."""
     back, box = _towards(azimuth, elevation), corners(lower, upper)
     half = np.tan(0.5 * np.radians(picture.field_of_view)) / 1.10
     halves = half, half * picture.height / picture.width
@@ -326,8 +306,7 @@ def fitted(lower: Points, upper: Points, elevation: float, picture: Picture, azi
 
 
 def screen_axes(forward: Points) -> tuple[Points, Points]:
-    """Return two unit vectors (3,) that point right and up on the screen, for a camera that looks along ``forward``
-    (3,)."""
+    """Return unit vectors (3,) to the right and upwards on the screen."""
     helper = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.999 * np.linalg.norm(forward) else np.array([0, 0, -1.0])
     right = np.cross(forward, helper)
     right /= np.linalg.norm(right)

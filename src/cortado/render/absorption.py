@@ -35,13 +35,12 @@ SAMPLES_PER_CELL = 2
 
 @cache
 def brightness_functions(precision: Precision) -> tuple[Any, Any]:
-    """Return two Warp functions: E(u) = (1 - exp(-u)) / u, and its derivative. The arguments of both functions are u
-    and exp(-u)."""
+    """Return Warp functions of u and exp(-u): E(u) = (1 - exp(-u)) / u, and its derivative."""
     real = precision.real
 
     @wp.func
     def brightness(u: real, passed: real) -> real:
-        """Return E(u) = (1 - exp(-u)) / u. For u below 0.1 a power series is used."""
+        """Below u = 0.1 a power series avoids cancellation."""
         if u > real(0.1):
             return (real(1.0) - passed) / u
         total = real(1.0)
@@ -51,7 +50,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
     @wp.func
     def brightness_derivative(u: real, passed: real) -> real:
-        """Return the derivative of E(u) with respect to u. For u below 0.1 a power series is used."""
+        """Below u = 0.1 a power series avoids cancellation."""
         if u > real(0.1):
             return (passed * (real(1.0) + u) - real(1.0)) / (u * u)
         total = real(1.0)
@@ -64,7 +63,7 @@ def brightness_functions(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
-    """Return the kernels of ray marching, and a kernel for the adjoint of the colour field."""
+    """Return the kernels of ray marching, and the kernel for the adjoint of the colour field."""
     real, vector, rgba, pose = precision.real, precision.vector, rgba_type(precision), precision.six
     nodes_struct, camera_struct = nodes_type(precision), camera_type(precision)
     change = camera_tangent_type(precision)
@@ -86,7 +85,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def march(camera, nodes, thickness: real, background: vector, field, image, spans):
-        """Compute the image of a colour field. ``spans`` has the range of samples inside the grid for each ray."""
+        """``spans`` has the range of samples inside the grid for each ray."""
         pixel = wp.tid()
         o = start(pixel, camera)
         d = direction(pixel, camera)
@@ -139,7 +138,6 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     def march_adjoint(
         camera, nodes, thickness: real, field, image, spans, image_bar, samples_bar: samples, pose_bar: poses
     ):
-        """Compute the adjoints of the samples on each ray, and the adjoint of the camera's pose."""
         pixel = wp.tid()
         bar = image_bar[pixel]
         o = start(pixel, camera)
@@ -171,8 +169,7 @@ def absorption_kernels(precision: Precision) -> tuple[Kernels, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def gather(camera, nodes, spans, samples_bar: samples, field_bar):
-        """Compute the adjoint of each grid node, from the adjoints of the samples in the eight cells around
-        the node."""
+        """Sum the adjoints of the samples in the eight cells around each node."""
         k, j, i = wp.tid()
         x_g = place(i, j, k, nodes)
         lower = x_g - diagonal(nodes)
@@ -222,8 +219,7 @@ class RayMarcher:
         launch(self._kernels.forward, self.pixels, self._device, self._known, background=self._background, field=field)
 
     def tangent(self, field: wp.array, field_dot: wp.array, along: ViewTangent) -> wp.array:
-        """Return the tangent of the image (pixels,), given the tangents of the field and of the view. The next call of
-        ``tangent`` or ``adjoint`` overwrites the result."""
+        """Return the tangent of the image (pixels,). The next ``tangent`` or ``adjoint`` overwrites the result."""
         vector, camera_dot = self._precision.vector, camera_tangent_type(self._precision)()
         camera_dot.position, camera_dot.turn = vector(*along.translation), vector(*along.rotation)
         camera_dot.half_width, camera_dot.growth = along.half_width
@@ -233,8 +229,8 @@ class RayMarcher:
         return self._image_bar
 
     def adjoint(self, image_bar: np.ndarray, field: wp.array) -> tuple[wp.array, np.ndarray]:
-        """Return the derivatives with respect to the field and with respect to the camera's pose (6,). ``image_bar``
-        (pixels, 3) is the derivative with respect to the image."""
+        """Return the derivatives of a function of the image with respect to the field and the camera's pose (6,).
+        ``image_bar``         (pixels, 3) is the derivative with respect to the image."""
         self._image_bar.assign(image_bar)
         bars = {"image_bar": self._image_bar, "samples_bar": self._samples_bar, "pose_bar": self._pose_bar}
         launch(self._kernels.adjoint, self.pixels, self._device, self._known, bars, field=field)

@@ -18,8 +18,7 @@ Vector = tuple[float, ...]
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
-    """Return ``values`` as a tuple of the given length. Raises `InputError` for values that are not finite numbers, or
-    for a wrong length. The error mentions the argument ``name``."""
+    """Return ``values`` as a tuple. Raises `InputError` if they are not ``length`` finite numbers."""
     found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
@@ -82,8 +81,7 @@ class Camera:
 
     @property
     def half_width(self) -> tuple[float, float]:
-        """Half the width of the visible region at the camera [m], and the growth of this half width per metre of depth
-        [-]."""
+        """Half the visible width at the camera [m], and the growth of the half width with depth [-]."""
         raise NotImplementedError
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
@@ -291,8 +289,7 @@ class Calibration:
 
     @property
     def unseen(self) -> dict[str, np.ndarray]:
-        """Masks by parameter name, which are True for components without effect on pictures. For parallel rays, an
-        example is the camera's movement along the viewing direction."""
+        """Masks by parameter name, True for components without effect on pictures."""
         camera = self.aimed.camera
         if "translation" not in self.names or not isinstance(camera, Orthographic):
             return {}
@@ -312,8 +309,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """Return the rate of change of the view at the parameter ``values`` along ``directions``. Omitted directions
-        are 0."""
+        """Return the rate of change of the view along ``directions``. Omitted directions are 0."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO

@@ -30,9 +30,7 @@ from cortado.errors import InputError
 from cortado.particles.neighbourhood import Discretisation
 
 MOST_NODES = 2**27
-"""Greatest number of nodes in the grid."""
 MOST_CELLS = 2**20
-"""Greatest number of cells into which particles are sorted."""
 
 
 @cache
@@ -42,8 +40,8 @@ def rgba_type(precision: Precision) -> Any:
 
 @cache
 def nodes_type(precision: Precision) -> Any:
-    """Return the Warp struct of a regular grid. ``cell`` [m] is the distance between nodes. Arrays over nodes are
-    indexed [z, y, x]. ``period`` is the length of the periodic box along each axis [m], or 0."""
+    """Arrays over nodes are indexed [z, y, x]. ``cell`` [m] is the distance between nodes, and ``period`` [m] is the
+    length     of the periodic box along each axis, or 0."""
     real, vector = precision.real, precision.vector
     sizes, periods = {"cell": real, "frequency": real, "shape": wp.vec3i}, {"period": vector, "turn": vector}
     return struct_of("Nodes", precision, origin=vector, **sizes, periodic=wp.int32, **periods, images=wp.vec3i)
@@ -51,8 +49,7 @@ def nodes_type(precision: Precision) -> Any:
 
 @cache
 def node_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Return three Warp functions: ``place`` returns the position of a node [m], and ``nearest`` the shortest periodic
-    image of a vector. The function ``image`` returns the position of a periodic image of a particle."""
+    """``nearest`` returns the shortest periodic image of a vector."""
     real, vector = precision.real, precision.vector
     nodes_struct = nodes_type(precision)
 
@@ -86,7 +83,7 @@ def colours_type(precision: Precision, phases: int) -> Any:
 
 @cache
 def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
-    """Return kernels that compute the colours of particles. ``forward`` and ``tangent`` also sort the particles."""
+    """The kernels ``forward`` and ``tangent`` also sort the particles."""
     vector, fractions = precision.vector, precision.fractions(phases)
     colours_matrix = colours_type(precision, phases)
     module = kernel_module(f"phase_colour_{phases}_{precision.name}")
@@ -113,8 +110,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def phase_colour_adjoint(colours, c_scene, tint_scene_bar, c_scene_bar, colours_bar):
-        """Compute the adjoints of the mass fractions, and each particle's contribution to the adjoint of the phase
-        colours."""
+        """``colours_bar`` has each particle's contribution to the adjoint of the phase colours."""
         j = wp.tid()
         bar = tint_scene_bar[j]
         c_scene_bar[j] = colours[0] * bar
@@ -125,8 +121,7 @@ def phase_colour_kernels(precision: Precision, phases: int) -> Kernels:
 
 @cache
 def colour_field_kernels(discretisation: Discretisation) -> Kernels:
-    """Return the kernels of the colour field. ``forward`` and ``tangent`` have one thread for each node. ``adjoint``
-    has one thread for each sorted particle."""
+    """``forward`` and ``tangent`` have a thread for each node. ``adjoint`` has a thread for each particle."""
     precision = discretisation.precision
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct, grid_type = nodes_type(precision), cell_grid_type(precision)
@@ -144,7 +139,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
     def row_sum(
         row: int, c_x: int, x_g, x: wp.array(dtype=vector), colour: wp.array(dtype=vector), nodes, grid, h, per_h, sigma
     ) -> rgba:
-        """Return the sum at a node over the particles in three cells that follow each other along x."""
+        """Sum over the particles in three adjacent cells along x."""
         n = grid.shape[0]
         total = rgba()
         for o in range(below(n), above(n)):
@@ -196,8 +191,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 
     @wp.func
     def first_node(s: real, n: int) -> int:
-        """Return the index of the first node at or above the coordinate ``s``, measured in node distances. There are
-        ``n`` nodes."""
+        """Return the first of ``n`` nodes at or above the coordinate ``s``, in node distances."""
         return int(wp.clamp(wp.ceil(s), real(0.0), real(n)))
 
     @wp.kernel(module=module, enable_backward=False)
@@ -231,8 +225,7 @@ def colour_field_kernels(discretisation: Discretisation) -> Kernels:
 def nodes_over(
     lower: np.ndarray, upper: np.ndarray, periods: np.ndarray, cell: float, support: float, precision: Precision
 ) -> Any:
-    """Return a grid of nodes with distance ``cell`` [m] over the region from ``lower`` to ``upper`` (d,) [m]. Along
-    axes that are not periodic, the grid is extended by the support radius. In 2-D there is one layer of nodes."""
+    """The region from ``lower`` to ``upper`` (d,) [m] is extended by the support radius, except along periodic axes."""
     margin = np.where(periods > 0.0, 0, int(np.ceil(support / cell)))
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
@@ -279,8 +272,7 @@ class ColourField:
         """Colour times coverage (three components), then coverage, at the nodes (nz, ny, nx) [-]."""
 
     def gather(self, positions: wp.array, fractions: wp.array, colours: np.ndarray) -> None:
-        """Compute the field from particle positions (n,) [m], mass fractions (n,) [-] and the colours of the phases
-        (phases, 3)."""
+        """Compute the field from positions (n,) [m], mass fractions (n,) and phase colours (phases, 3)."""
         self._sort(positions)
         wp.copy(self._fractions, fractions)
         self._colours.assign(colours[None])
@@ -290,8 +282,7 @@ class ColourField:
         launch(self._field.forward, self.values.shape, self._device, self._kernel, own, given)
 
     def tangent(self, positions_dot: wp.array, fractions_dot: wp.array, colours_dot: np.ndarray) -> wp.array:
-        """Return the tangent (nz, ny, nx) of the last computed field, given tangents of positions (n,), mass fractions
-        (n,) and phase colours (phases, 3). The next call of ``tangent`` or ``adjoint`` overwrites the result."""
+        """Return the tangent (nz, ny, nx) of the last field. The next ``tangent`` overwrites the result."""
         own = {"x": self._x, "colour": self._colour, "x_dot": self._x_bar, "colour_dot": self._colour_bar}
         along = {"x_scene_dot": positions_dot, "c_scene_dot": fractions_dot, "colours_dot": self._colours_dot}
         self._colours_dot.assign(colours_dot[None])
@@ -306,8 +297,7 @@ class ColourField:
         return wp.zeros_like(self.values)
 
     def adjoint(self, field_bar: wp.array) -> tuple[wp.array, wp.array, np.ndarray]:
-        """Return the derivatives with respect to positions (n,), mass fractions (n,) and phase colours (phases, 3).
-        ``field_bar`` is the derivative with respect to the field."""
+        """Return derivatives with respect to positions (n,), mass fractions (n,) and phase colours (phases, 3)."""
         own = {"x": self._x, "colour": self._colour, "nodes": self.nodes, "field_bar": field_bar}
         bars = {"x_scene_bar": self._x_bar, "tint_scene_bar": self._colour_bar}
         bars |= {"c_scene_bar": self._fractions_bar, "colours_bar": self._colours_bar}

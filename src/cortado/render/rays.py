@@ -21,9 +21,8 @@ from cortado.render.colour_field import nodes_type, rgba_type
 
 @cache
 def camera_type(precision: Precision) -> Any:
-    """Return the Warp struct of a camera. The columns of ``orientation`` point right, up and backwards. ``half_width``
-    [m] is half the visible width at the camera. ``growth`` [-] is the increase of the half width per depth. Samples
-    along a ray begin at the distance ``near`` [m] and are ``step`` [m] apart."""
+    """The columns of ``orientation`` point right, up and backwards. ``half_width`` [m] is half the visible width at the
+    camera, and ``growth`` [-] is the increase of the half width with depth."""
     real, pixels = precision.real, {"columns": wp.int32, "rows": wp.int32}
     pose, widths = {"position": precision.vector, "orientation": precision.matrix}, {"half_width": real, "growth": real}
     ray = {"near": real, "step": real, "samples": wp.int32}
@@ -39,8 +38,6 @@ def camera_tangent_type(precision: Precision) -> Any:
 
 @cache
 def ray_functions(precision: Precision) -> tuple[Any, ...]:
-    """Return Warp functions of rays. ``samples_within`` returns the samples inside a box, and ``pixels_before`` the
-    pixels in front of a box."""
     real, vector = precision.real, precision.vector
     camera_struct, tangent_struct = camera_type(precision), camera_tangent_type(precision)
     tiny, huge = wp.constant(real(precision.tiny)), wp.constant(real(1.0 / precision.tiny))
@@ -97,8 +94,7 @@ def ray_functions(precision: Precision) -> tuple[Any, ...]:
 
     @wp.func
     def pixels_before(lower: vector, upper: vector, c: camera_struct) -> wp.vec4i:
-        """Return the ranges of columns and rows that may show a box: the first column, the last column plus 1, the
-        first row, and the last row plus 1."""
+        """Return the columns and rows that may show a box: first column, last column plus 1, then rows."""
         n_x = real(c.columns)
         n_y = real(c.rows)
         left = n_x
@@ -141,7 +137,6 @@ def ray_functions(precision: Precision) -> tuple[Any, ...]:
 
 @cache
 def interpolation_functions(precision: Precision) -> tuple[Any, ...]:
-    """Return Warp functions of the interpolated field: its value, its derivatives, and the weight of a node."""
     real, vector, rgba = precision.real, precision.vector, rgba_type(precision)
     nodes_struct = nodes_type(precision)
 

@@ -20,15 +20,14 @@ class LitSurface:
     """Outward unit normals at the vertices (points,)."""
     colours: Vec3s
     light: Vec3s
-    """Light that falls on the surface at each vertex (points,). Light of 1 gives a white surface the brightness 1."""
+    """Light on each vertex (points,). Light of 1 gives a white surface the brightness 1."""
     media: Vec2s
     """Scattering and absorption coefficients of the fluid at each vertex (points,) [1/m]."""
     is_flat: wp.int32
     reach: wp.float32
     """Greatest distance [m] to which the fluid's surface extends behind a container wall."""
     left: Vec2s
-    """Fractions of light (triangles,) that a transparent solid transmits at each triangle, for rays from inside and
-    from outside."""
+    """Fractions of light that a transparent triangle transmits from inside and from outside (triangles,)."""
     reflectivity: Floats
     """Mirror reflectivity of each triangle of an opaque solid (triangles,)."""
     from_edges: wp.array(dtype=wp.mat33)
@@ -46,7 +45,7 @@ def at_corners(surface: LitSurface, values: wp.array(dtype=Any), face: wp.int32,
 
 @wp.func
 def facing(normal: wp.vec3, face_normal: wp.vec3, d: wp.vec3):
-    """Return an interpolated normal, turned so that it points against the direction ``d`` of a ray."""
+    """Turn an interpolated ``normal`` against the direction ``d`` of a ray."""
     outside = face_normal
     n = normal
     if wp.dot(outside, d) > 0.0:
@@ -98,7 +97,6 @@ FAR = wp.constant(wp.float32(1.0e9))
 
 
 def shading_module(has_opaque: bool, has_clear: bool) -> Any:
-    """Return the Warp module of the shading kernels for scenes with or without opaque and transparent solids."""
     return kernel_module("shading" + "_opaque" * has_opaque + "_clear" * has_clear)
 
 
@@ -110,7 +108,7 @@ class Solids:
     """Mesh of transparent solids and of tanks."""
     has_tank: wp.int32
     surfaces: wp.array(dtype=LitSurface)
-    """Two surfaces: the surface of all opaque solids, then the surface of all transparent solids."""
+    """The surface of all opaque solids, and the surface of all transparent solids."""
 
 
 @wp.struct
@@ -142,15 +140,12 @@ class Environment:
     glass_lower: wp.vec3
     """Lower corner of the container in container axes [m]."""
     glass_upper: wp.vec3
-    """Upper corner of the container in container axes [m]."""
     has_room: wp.int32
     room_lower: wp.vec3
     """Lower corner of the shown region in container axes [m], -FAR if the region is infinite."""
     room_upper: wp.vec3
-    """Upper corner [m] of the region in which fluid is shown, in container axes."""
     panes: wp.mat33
-    """Mask of the container's sides that are panes of glass. The first row is for lower sides, the second row for upper
-    sides, and each column is for one axis."""
+    """Mask of panes of glass, for lower and upper sides (rows 0 and 1) along each axis (columns)."""
     edge_colour: wp.vec3
     has_walls: wp.int32
     """True for an opaque container."""
@@ -180,7 +175,6 @@ def mirrored(direction: wp.vec3, normal: wp.vec3):
 
 @wp.func
 def sky(s: Environment, d: wp.vec3):
-    """Return the light that the sky and its lamps send along a ray with the direction ``d``."""
     base = wp.lerp(s.horizon, s.zenith, smooth_step(0.0, 0.9, d[1]))
     lamp = smooth_step(0.945, 0.985, wp.dot(d, s.sun))
     strip = smooth_step(0.90, 0.96, wp.dot(d, s.fill))
@@ -217,7 +211,7 @@ def line(x: wp.float32, grid: wp.float32, width: wp.float32):
 
 @wp.func
 def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
-    """Return the colour of the floor at a point p. ``footprint`` is the width of a pixel at p [m]."""
+    """``footprint`` is the width of a pixel at the point ``p`` [m]."""
     colour = s.floor_colour
     if s.grid > 0.0:
         thin = 0.0035 * s.size
@@ -231,8 +225,7 @@ def floor(s: Environment, shadow: Vec3s2d, p: wp.vec3, footprint: wp.float32):
 
 @wp.func
 def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spread: wp.float32):
-    """Return the light along a ray that hits neither fluid nor glass. ``spread`` [m] is the width of a pixel at 1 m
-    from the camera."""
+    """``spread`` [m] is the width of a pixel at 1 m from the camera."""
     if s.has_floor > 0 and d[1] < -1.0e-4:
         t = (s.floor_height - o[1]) / d[1]
         if t > 0.0:
@@ -243,8 +236,7 @@ def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spr
 
 @wp.func
 def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """Shorten the interval ``span`` of a ray to the interval between two planes perpendicular to an axis. ``o`` and
-    ``d`` are the components of the ray's origin and direction along this axis."""
+    """Cut the interval ``span`` of a ray at two planes. ``o`` and ``d`` are components along the normal of the planes."""
     if wp.abs(d) > 1.0e-9:
         t1 = (lower - o) / d
         t2 = (upper - o) / d
@@ -256,8 +248,7 @@ def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, 
 
 @wp.func
 def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """Return the interval of a ray inside an upright cylinder that fills the box from ``lower`` to ``upper``. If the
-    ray misses the cylinder, the interval is empty: (FAR, -FAR)."""
+    """Return the interval of a ray inside an upright cylinder in a box, or (FAR, -FAR) for a miss."""
     radius = 0.5 * (upper[0] - lower[0])
     x = o[0] - 0.5 * (lower[0] + upper[0])
     z = o[2] - 0.5 * (lower[2] + upper[2])
@@ -275,8 +266,7 @@ def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the interval of a ray inside the container. If the ray misses the container, the interval is empty: (FAR,
-    -FAR)."""
+    """Return the interval of a ray inside the container, or (FAR, -FAR) for a miss."""
     p = s.glass_frame * o
     q = s.glass_frame * d
     span = wp.vec2(-FAR, FAR)
@@ -292,8 +282,7 @@ def within_walls(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def room(s: Environment, o: wp.vec3, d: wp.vec3):
-    """Return the interval of a ray inside the region in which fluid is shown. If the ray misses the region, the
-    interval is empty: (FAR, -FAR)."""
+    """Return the interval of a ray in which fluid is shown, or (FAR, -FAR) for a miss."""
     if s.has_room == 0:
         return wp.vec2(-FAR, FAR)
     return within_walls(s, o, d)
@@ -301,7 +290,7 @@ def room(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def wall_normal(s: Environment, p: wp.vec3):
-    """Return the outward normal of the wall at a point."""
+    """Return the outward normal of the nearest container wall."""
     q = s.glass_frame * p
     n = wp.vec3(0.0)
     best = FAR
@@ -346,8 +335,7 @@ class Passed:
 def pane(
     s: Environment, d: wp.vec3, normal: wp.vec3, rim: wp.float32, is_pane: wp.float32, colour: wp.vec3, behind: Passed
 ):
-    """Add one sheet of glass to a ray. ``behind`` holds the nearer sheets, and ``rim`` is the visibility of the
-    coloured edge, from 0 to 1."""
+    """Add a sheet of glass behind nearer sheets. ``rim`` is the visibility of the coloured edge, from 0 to 1."""
     cosine = wp.abs(wp.dot(d, normal))
     f = schlick(0.04, cosine)
     reflectance = is_pane * wp.min(1.4 * f / (1.0 + f), MILKY)

@@ -49,8 +49,7 @@ class Mesh:
 
 
 def nearest_colours(points: Points, positions: Points, colours: Points, spacing: float) -> Points:
-    """Return colours (p, 3) at points (p, d) [m], averaged over the nearest particles. The particles have ``positions``
-    (n, d) [m] and ``colours`` (n, 3)."""
+    """Return the mean colours (p, 3) of the particles nearest to points (p, d) [m]."""
     from scipy.spatial import cKDTree
 
     distances, which = cKDTree(positions).query(points, k=min(NEIGHBOURS, len(positions)), workers=usable_cores())
@@ -60,7 +59,7 @@ def nearest_colours(points: Points, positions: Points, colours: Points, spacing:
 
 
 def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
-    """Make a sphere around each particle at ``positions`` (n, 3) [m], with its colour (n, 3)."""
+    """Make a sphere around each particle at ``positions`` (n, 3) [m] with ``colours`` (n, 3)."""
     corners, triangles = _sphere(2 if len(positions) <= ROUND else 1)
     n, k = len(positions), len(corners)
     return Mesh(
@@ -73,8 +72,7 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
 
 @cache
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
-    """Return the vertices (k, 3) and triangles of a unit sphere. The sphere is made from an octahedron whose triangles
-    are divided ``levels`` times."""
+    """Return the vertices (k, 3) of a unit sphere, an octahedron whose triangles are divided ``levels`` times."""
     octants = np.array([np.diag(signs) for signs in product((1.0, -1.0), repeat=3)])
     triangles = np.array([one if np.linalg.det(one) > 0.0 else one[[0, 2, 1]] for one in octants]) + 0.0  # no -0
     for _ in range(levels):
@@ -144,8 +142,7 @@ crowd_near, tint_near = sum_near(crowd, wp.vec2), sum_near(tint, WeightedLook)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_weights(first: wp.int32, s: NearParticles, reach: wp.float32, points: Vec3s, weights: Floats):
-    """Compute the smoothing weight of each surface point. The weight is small near few particles (Löschner et al.
-    2023)."""
+    """Points in thin sheets get small smoothing weights (Löschner et al. 2023)."""
     v = first + wp.tid()
     near = crowd_near(s, points[v], reach)
     x = wp.min(near[0] / wp.max(near[1], 1.0e-9) / FULL, 1.0)
@@ -174,7 +171,7 @@ place_near = sum_near(place, wp.vec4)
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Floats):
-    """Compute the volumes of particles. Particles in thin sheets get smaller volumes."""
+    """Particles in thin sheets get smaller volumes."""
     i = first + wp.tid()
     near = place_near(s, s.places[i], reach)
     off = (wp.vec3(near[0], near[1], near[2]) / near[3] - s.places[i] + s.lower) / s.spacing
@@ -189,8 +186,7 @@ Level = tuple[Any, wp.array]
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
-    """Return the density of the fluid on a lattice of cubes, and the particles as `NearParticles`. The cubes are at
-    least ``least`` particle spacings wide."""
+    """The cubes of the lattice are at least ``least`` particle spacings wide."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
     s = near_particles(particles, ends, spacing, reach, launch)
@@ -205,8 +201,7 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, lea
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
-    """Make the surface of the fluid, an isosurface of its density. The smoothing preserves thin sheets (Löschner et al.
-    2023). Raises `ComputationError` if there is no surface."""
+    """The smoothing preserves thin sheets (Löschner et al. 2023). Raises `ComputationError` without a surface."""
     device, reach = launch.device, REACH * spacing
     if level is None:
         level, s = liquid_level(particles, spacing, launch, least)

@@ -36,8 +36,7 @@ AT_ONCE = 8000
 
 
 def mixed(fractions: Points, values: Points) -> Points:
-    """Return particle values (n, c), mixed from ``values`` of the phases (phases, c) by mass ``fractions`` (n,
-    phases)."""
+    """Mix ``values`` of phases (phases, c) by mass ``fractions`` (n, phases) into values (n, c)."""
     found, shares = np.empty((len(fractions), values.shape[1])), np.clip(fractions, 0.0, 1.0)
     for first in range(0, len(shares), AT_ONCE):
         np.matmul(shares[first : first + AT_ONCE], values, out=found[first : first + AT_ONCE])
@@ -53,8 +52,8 @@ class Particles:
 
     @classmethod
     def on(cls, device: Any, places: Points, colours: Points, media: ArrayLike = OPAQUE) -> "Particles":
-        """Copy positions (n, 3) [m] and colours (n, 3) from NumPy arrays to a device. ``media`` (n, 2) or (2,) are
-        scattering and absorption coefficients [1/m]. Raises `ComputationError` for positions that are not finite."""
+        """``media`` (n, 2) or (2,) are scattering and absorption [1/m]. Raises `ComputationError` for positions that
+        are not         finite."""
         finite = np.isfinite(places)
         if not finite.all():
             astray = len(places) - int(finite.all(axis=1).sum())
@@ -195,8 +194,7 @@ def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: 
 def near_particles(
     given: Particles, ends: tuple[np.ndarray, np.ndarray], spacing: float, reach: float, launch: BandLauncher
 ) -> Any:
-    """Sort the particles in the box between the corners ``ends`` (3,) [m] into cells. Sums over the particles within
-    ``reach`` [m] of a point use these cells."""
+    """Sort the particles in the box ``ends`` (3,) [m] for sums within ``reach`` [m] of a point."""
     device, lower = launch.device, np.floor(ends[0] / spacing) * spacing
     x, y, z = (int(n) + 1 for n in np.floor((ends[1] - lower) / spacing))
     sorting = CellSort(Grid(lower, np.full(3, spacing), (x, y, z)), len(given), FLOAT32, device)

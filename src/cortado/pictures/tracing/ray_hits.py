@@ -90,7 +90,7 @@ def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 
 @wp.func
 def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32):
-    """Return the light that a solid sends back along a ray from the hit ``met``. Inside fluid, ``glossy`` is 0."""
+    """Return the light that a solid sends back along a ray. Inside fluid, ``glossy`` is 0."""
     r = mirrored(d, met.normal)
     seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
@@ -104,8 +104,7 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """Add the transparent solids along a ray, up to the distance ``most`` [m], to the light and transmission
-    ``before``."""
+    """``most`` [m] is the greatest distance along the ray, and ``before`` is the light of nearer layers."""
     passed = before
     start = s.nearest
     for _ in range(LAYERS):
@@ -143,8 +142,7 @@ def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
 
 @wp.func
 def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before: Passed):
-    """Add the opaque container wall along a ray, up to the distance ``most`` [m], to the light and transmission
-    ``before``."""
+    """``most`` [m] is the greatest distance along the ray, and ``before`` is the light of nearer layers."""
     part = within_walls(s, o, d)
     t = part[1]
     if t <= wp.max(part[0], s.nearest) or t >= most:
@@ -162,7 +160,7 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 
 @wp.func
 def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
-    """Add a glass side of a box to a ray, at the point ``q`` in container axes."""
+    """The point ``q`` is in container axes, and ``before`` is the light of nearer layers."""
     axis = wp.int32(0)
     best = FAR
     side = wp.int32(0)
@@ -189,7 +187,7 @@ def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: 
 
 @wp.func
 def tube_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
-    """Add the glass side of a cylinder to a ray, at the point ``q`` in container axes."""
+    """The point ``q`` is in container axes, and ``before`` is the light of nearer layers."""
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
         return before
     x = 0.5 * (s.glass_lower[0] + s.glass_upper[0])
@@ -256,7 +254,7 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
 
 @wp.func
 def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
-    """Return the hit of a ray on the fluid's surface. A hit behind a container wall is moved to the wall."""
+    """Move a hit behind a container wall to the wall."""
     near = wp.mesh_query_point_no_sign(surface.mesh, p, surface.reach)
     if not near.result:  # deep within fluid that has just reached the wall
         near = wp.mesh_query_point_no_sign(surface.mesh, p, s.size)
@@ -304,7 +302,6 @@ def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part
 
 @wp.func
 def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
-    """Find where a ray enters the fluid, in a scene with transparent solids."""
     met = SurfaceHit()
     met.found = False
     met.t = FAR

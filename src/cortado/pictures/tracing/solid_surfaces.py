@@ -37,8 +37,6 @@ Soften = Callable[[wp.array], wp.array]
 
 @dataclass(frozen=True)
 class DeviceSurface:
-    """A triangle surface on a device."""
-
     mesh: wp.Mesh
     lit: Any
     softened: Soften | None = None
@@ -47,8 +45,7 @@ class DeviceSurface:
     def of(
         cls, points: wp.array, triangles: wp.array, normals: wp.array, colours: wp.array, softened: Soften | None = None
     ) -> "DeviceSurface":
-        """Make a surface from device arrays: vertex positions ``points`` (p,) [m] and vertex indices ``triangles`` (3
-        t,)."""
+        """``points`` (p,) are in metres, and ``triangles`` (3 t,) are vertex indices."""
         mesh, found = wp.Mesh(points, triangles), LitSurface()
         found.mesh, found.corners, found.normals, found.colours = mesh.id, triangles, normals, colours
         found.light, found.media = wp.zeros_like(points), wp.zeros(len(points), dtype=wp.vec2, device=points.device)
@@ -89,8 +86,7 @@ typed = TypesByName(
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def cast(places, looks, volumes, corner, cell, slope, fading, begin, thickness):
-    """Add the shadow of each particle to the four nearest floor nodes. ``fading`` [1/m] is the rate at which the shadow
-    fades with height."""
+    """``fading`` [1/m] is the rate at which a shadow fades with height."""
     i = wp.tid()
     height = places[i][1] - corner[1]
     x = (places[i][0] - height * slope[0] - corner[0]) / cell
@@ -134,7 +130,7 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
-    """Reduce the light at floor nodes by two shadows: from the light of the lamp and from the light of the sky."""
+    """Reduce ``light`` in place, by the shadow of the lamp and by the shadow of the sky."""
     n = first + wp.tid()
     i = n / key.shape[1]
     j = n % key.shape[1]
@@ -176,8 +172,7 @@ class FloorShadow:
         self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.transparency, 0.0)
 
     def _add(self, parts: Particles, volumes: list[wp.array], least: float, opacity: float, tinted: float) -> None:
-        """Add the shadows of particles from the lamp and from the sky. ``volumes`` are two arrays (n,) [m3], for lamp
-        and sky. ``least`` [m] is the smallest width of the blur."""
+        """``volumes`` (n,) [m3] are for lamp and sky. ``least`` [m] is the smallest width of the blur."""
         if not len(parts):
             return
         stage = self._stage
@@ -207,7 +202,6 @@ class FloorShadow:
         return first.tolist(), (rows, columns)
 
     def _thickness(self, parts: Particles, volumes: wp.array, bell: Points, shape: tuple[int, int], **at: Any) -> Any:
-        """Return the thickness of fluid or solid above each floor node, blurred."""
         sharp = wp.zeros(shape, dtype=wp.vec4, device=self._device)
         given = {"places": parts.places, "looks": parts.looks, "volumes": volumes}
         launch_once(cast, len(volumes), self._device, **given, **at, thickness=sharp)
@@ -221,8 +215,6 @@ class FloorShadow:
 
 
 class SolidSurfaces:
-    """The triangle surfaces of the solids of a stage."""
-
     def __init__(self, stage: Stage, device: Any):
         self._stage, self._device, self._own = stage, device, dict[str, SolidMesh]()
         for one in stage.solids:  # relative to its middle; that of a tank is of its cavity
@@ -243,8 +235,7 @@ class SolidSurfaces:
                 shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
-        """Return the Warp struct `Solids` and the device surfaces of ``solids`` at their present poses. Keep a
-        reference to the device surfaces while the struct is used."""
+        """Return a struct `Solids` and its surfaces. Keep the surfaces alive while the struct is used."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         for k, is_clear in enumerate((False, True)):

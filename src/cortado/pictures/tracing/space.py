@@ -52,21 +52,18 @@ from cortado.scene.scene import Scene
 SKIN = 0.7
 """Approximate distance from a particle to the drawn surface [spacings]."""
 DEPTHS = (1.0, 0.7, 0.4, 0.1)
-"""Possible depths of a mirror image behind a surface, relative to the particle's distance from the surface. The first
-depth that hides the image inside the solid is used."""
+"""Depths of a mirror image, relative to the particle's distance from the surface. The first depth that hides the image
+inside the solid is used."""
 ON_SURFACE = 0.05
 """Greatest distance of a point from a surface at which it counts as on the surface [spacings]."""
 SAME_SIDE = 0.8
-"""Cosine of the angle between two normals of a solid. Above this cosine, the normals belong to the same side."""
+"""Cosine of the angle between two normals of a solid, above which both normals belong to the same side."""
 
 
 def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing: float) -> tuple[Points, np.ndarray]:
-    """Return the mirror images (m, d) [m] of points (n, d) [m] behind solids. Also return the index of the original
-    point of each image (m,).
-
-    A point touches a side of a solid at a distance below ``near`` [m]. The point has an image behind each touched side,
-    and behind the corner between touched sides. Behind a thin solid the image is closer to the surface or left out.
-    """
+    """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the index of each original point (m,).
+    A point has an image behind each side nearer than ``near`` [m], and behind corners between these sides. Behind a
+    thin     solid the image is closer to the surface or left out."""
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
     for shown in solids:
@@ -112,8 +109,7 @@ def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
 def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
-    """Return particles in picture axes. ``positions`` (n, 3) [m] are in scene axes. ``fractions`` (n, phases) are mass
-    fractions, by default equal for all phases."""
+    """``positions`` (n, 3) [m] are in scene axes, and the returned particles are in picture axes."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -123,8 +119,7 @@ def particles_of(
 
 @wp.func
 def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32):
-    """Return a bit mask of the mirror images of a particle at ``q`` along an axis. Bit 1 is for the lower wall and bit
-    2 for the upper wall."""
+    """Return a bit mask of mirror images along an axis: 1 for the lower wall, and 2 for the upper wall."""
     found = wp.int32(0)
     if s.glass == wp.static(GLASS_BOX) or axis == 1:
         if wp.abs(q[axis] - s.room_lower[axis]) < TOUCHING * spacing:
@@ -141,7 +136,7 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """Return the vector from a particle at ``q`` to one of its mirror images along an axis."""
+    """Return the vector from a particle at ``q`` to a mirror image along an axis."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -179,7 +174,6 @@ def list_images(
     image_places: Vec3s,
     image_looks: wp.array(dtype=Look),
 ):
-    """Store the positions and colours of particles and of their mirror images."""
     i = first + wp.tid()
     n = wp.int32(0)
     if i > 0:
@@ -286,8 +280,7 @@ class SpacePainter:
             return self._rays(*self.scenery(State(*state)))
 
     def still(self, state: State) -> Any:
-        """Return the drawn fluid of a state as a `Still`, for averages over frames. Return None if the fluid is not
-        drawn as a surface."""
+        """Return None if the fluid is not drawn as a surface."""
         with WARP:
             compile_ahead(self, self.device)
             stage, s, particles, shadow = self._placed(state)
@@ -299,14 +292,12 @@ class SpacePainter:
             return still_of(level, near, shadow.light, self._launch)
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
-        """Draw a state as a frame of a film, averaged with other frames against flickering. See `steadied`."""
         with WARP:
             steady = steadied(own, before, after, self.stage.spacing, self._launch)
             return self._rays(*self.scenery(state, steady))
 
     def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
-        """Return the stage of a state, its `Environment`, the fluid's surface and the floor shadow. An optional `Still`
-        in ``steady`` provides an averaged surface and an averaged shadow."""
+        """A `Still` in ``steady`` provides an averaged surface and an averaged shadow."""
         stage, s, particles, shadow = self._placed(state)
         if steady is None:
             shadow.of_fluid(particles)

@@ -1,10 +1,6 @@
-"""Averages the drawn surface over frames of a film, so that fluid at rest does not flicker.
-
-Particles of fluid at rest drift by fractions of a spacing, and the surface drifts with the particles. The lattice of
-the surface is divided into blocks. In each block, the change of the mean density measures how far the fluid moves
-between frames. Frames are averaged if the fluid moves less than a fraction of a spacing. Moving fluid and drops are
-drawn unchanged.
-"""
+"""Averages the drawn surface over frames of a film, so that fluid at rest does not flicker.  Particles of fluid at rest
+drift by fractions of a spacing. In each block of the lattice, the change of the mean density measures how far the fluid
+moves between frames. Moving fluid and drops are drawn unchanged."""
 
 from collections.abc import Sequence
 from itertools import takewhile
@@ -60,7 +56,7 @@ def share(way: wp.float32, limits: wp.vec2):
 
 @wp.func
 def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
-    """Return the weight of frame ``j``, which decreases with the number of frames between it and the averaged frame."""
+    """The weight decreases with the number of frames between frame ``j`` and the averaged frame."""
     away = wp.where(j < before, j, j - before) + 1
     return 1.0 - float(away) / float(window + 1)
 
@@ -118,7 +114,6 @@ def find_ways(first, own, others, width, touching, indices, ways):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_shares(first, touching, ways, bodies, before, window, limits, shares):
-    """Compute the weight of each frame in each block."""
     n = first + wp.tid()
     left = bodies[n]
     for j in range(ways.shape[1]):
@@ -191,8 +186,7 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """Average the `Still` of a frame with the frames ``before`` and ``after`` it, each list sorted from the nearest
-    frame. All frames must have the same lattice. ``spacing`` is the particle spacing [m]."""
+    """Average a frame with the frames ``before`` and ``after`` it, each list sorted from the nearest frame."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

@@ -1,9 +1,6 @@
 """The isosurface of a density, as a net with one corner in each lattice cube that the surface crosses (Gibson 1998).
-
-The density is called level, and is stored at the nodes of a fixed lattice. The lattice is divided into blocks of
-`WIDTH` cubes along each axis. The level is computed only in blocks that may contain the surface. The net has a
-quadrilateral for each cube edge that the surface crosses.
-"""
+The density is called level. The lattice is divided into blocks of `WIDTH` cubes along each axis, and the level is
+computed only in blocks that may contain the surface. The net has a quadrilateral for each crossed edge of a cube."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -67,8 +64,7 @@ def block_at(b: Blocks, number: wp.int32):
 
 @wp.func
 def index_of(b: Blocks, at: wp.vec3i):
-    """Return the index of a block in ``levels``. The index is -1 for a block that is not in ``levels``, and -2 outside
-    the lattice."""
+    """Return the index of a block in ``levels``, -1 for a block without levels, or -2 outside the lattice."""
     if wp.min(wp.min(at[0], at[1]), at[2]) < 0 or at[0] >= b.shape[0] or at[1] >= b.shape[1] or at[2] >= b.shape[2]:
         return -2
     block = number_of(b, at[0], at[1], at[2])
@@ -89,7 +85,7 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """Return the density at a node. If it was not computed, return the density at the corner of the node's block."""
+    """Where no density was computed, return the density at the corner of the node's block."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -113,7 +109,7 @@ def volume(s: NearParticles, j: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def mark_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
-    """Mark the corners of blocks within ``reach`` of a particle."""
+    """Set ``b.corners`` to 1 within ``reach`` of a particle."""
     p = s.places[first + wp.tid()] - b.lower
     wide = b.cube * float(WIDTH)
     low = (p - wp.vec3(reach)) / wide
@@ -139,7 +135,6 @@ def find_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_passed(first: wp.int32, b: Blocks, left: wp.float32, passed: Ints):
-    """Mark the blocks that may contain the surface."""
     n = first + wp.tid()
     at = block_at(b, n)
     least = wp.float32(1.0e9)
@@ -162,9 +157,8 @@ def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks,
 def level_blocks(
     s: Any, ends: tuple[np.ndarray, np.ndarray], cube: float, reach: float, launch: BandLauncher
 ) -> tuple[Any, wp.array]:
-    """Compute the density of particles ``s`` in the box between the corners ``ends``, each (3,) [m]. The box is
-    extended by ``reach`` [m] on all sides. Return the `Blocks` and the indices of the blocks that may contain the
-    surface."""
+    """Return the density in the box ``ends`` (3,) [m], extended by ``reach`` [m]. Also return the indices of the blocks
+    that     may contain the surface."""
     device, wide = launch.device, WIDTH * cube
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
     b, shape = Blocks(), (high - low).astype(int)
@@ -193,8 +187,7 @@ class Cubes:
 
 @wp.func
 def signs_of(b: Blocks, node: wp.vec3i):
-    """Return a bit mask of the eight nodes of a cube that are inside the fluid. The node at the offset (x, y, z), each
-    0 or 1, has the bit number x + 2 y + 4 z."""
+    """Return a bit mask of the nodes inside the fluid. The node at (x, y, z) has the bit x + 2 y + 4 z."""
     signs = wp.int32(0)
     for n in range(8):
         if level_at(b, node + wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)) > LEVEL:
@@ -322,7 +315,7 @@ def smooth(first: wp.int32, neighbours: wp.array(dtype=Neighbours), weights: Flo
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_normals(first: wp.int32, signs: Ints, neighbours: wp.array(dtype=Neighbours), points: Vec3s, normals: Vec3s):
-    """Compute the normal at each net corner as the mean over its quadrilaterals, weighted by area."""
+    """The normal is the mean over the adjacent quadrilaterals, weighted by area."""
     v = first + wp.tid()
     beside = neighbours[v]
     total = wp.vec3(0.0)
@@ -365,7 +358,7 @@ class SurfaceNet:
 
 
 def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
-    """Make the net of an isosurface. ``blocks`` are the indices of the blocks that may contain the surface."""
+    """``blocks`` are the indices of the blocks that may contain the surface."""
     device, count, cubes = launch.device, len(blocks) * CUBES, Cubes()
     signs = wp.empty(count, dtype=wp.int32, device=device)
     cubes.b, cubes.blocks = b, blocks
@@ -380,14 +373,13 @@ def net_of(b: Any, blocks: wp.array, launch: BandLauncher) -> SurfaceNet:
 
 
 def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: int, launch: BandLauncher) -> wp.array:
-    """Smooth vectors (p,) at net corners in several ``rounds``. Each round moves a vector towards the mean of its
-    neighbours, by the fraction in ``weights`` (p,)."""
+    """Each round moves vectors (p,) towards the mean of their neighbours, by the fractions ``weights`` (p,)."""
     own = {"neighbours": neighbours, "weights": weights}
     return launch.to_and_fro(smooth, rounds, wp.clone(values), wp.empty_like(values), **own)
 
 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return outward unit normals (p,) at the net corners, which have the positions ``points`` (p,)."""
+    """Return outward unit normals (p,) at net corners with the positions ``points`` (p,)."""
     normals, other = wp.empty_like(points), wp.empty_like(points)
     own = {"signs": net.signs, "neighbours": net.neighbours}
     launch(find_normals, len(points), **own, points=points, normals=normals)
@@ -395,8 +387,7 @@ def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.ar
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return the triangles of a net as indices of its corners (3 t,). The net corners have the positions ``points``
-    (p,)."""
+    """Return indices of net corners (3 t,), three for each triangle."""
     found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
     given = {"cubes": net.cubes, "signs": net.cube_signs, "points": points}
     launch(list_triangles, len(net.cube_signs), **given, triangles=found)

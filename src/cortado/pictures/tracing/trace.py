@@ -61,12 +61,8 @@ BOUNCED = wp.constant(wp.float32(0.45))
 
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
-    """Return the light that reaches the point ``p`` from the direction ``d``, reduced by solids within ``reach`` [m].
-    Without solids, the result is ``light``.
-
-    A near solid blocks more light than a distant solid, and adds a little light of its colour. For a point inside a
-    solid, no light is blocked.
-    """
+    """A solid within ``reach`` [m] blocks light and adds light of its colour. A near solid blocks more than a distant
+    solid.     For a point inside a solid, no light is blocked."""
     hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
         return light
@@ -98,7 +94,6 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def illuminate(first, s, surface, points, normals, directions, sun_directions, reach, clearness, light):
-        """Compute the light on each surface point, from the lamp and from all directions."""
         i = first + wp.tid()
         n = normals[i]
         p = points[i] + s.nearest * n
@@ -144,8 +139,7 @@ DARK = wp.constant(wp.float32(10.0))
 
 @wp.struct
 class Eye:
-    """A camera. A pixel has screen coordinates a and b from -1 to 1, and its ray has the direction ``forward + a right
-    + b up``."""
+    """The ray of a pixel has the direction ``forward + a right + b up``, with a and b from -1 to 1."""
 
     position: wp.vec3
     forward: wp.vec3
@@ -293,8 +287,7 @@ def trace_kernel(has_opaque: bool, has_clear: bool) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed
     def trace(first, eye: Eye, s, surface, shadow, pixels, offsets, image):
-        """Compute the light of pixels, each the mean over rays. ``offsets`` are the distances of the rays from the
-        pixel's middle [pixels]."""
+        """The light of a pixel is the mean over rays at ``offsets`` from the pixel's middle [pixels]."""
         pixel = pixels[first + wp.tid()]
         spread = 2.0 * wp.length(eye.right) / wp.float32(eye.columns)
         light = wp.vec3(0.0)
