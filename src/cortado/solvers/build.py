@@ -75,7 +75,6 @@ class ForceMaker(Protocol):
 
 
 def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
-    """Return ``forces`` as a tuple. Raise `InputError` if an entry is not a maker of forces."""
     if not isinstance(forces, (list, tuple)):
         wanted = "a list of forces, such as [cortado.forces.Body(function, k=2.0)]"
         raise InputError(f"forces is {shown(forces)}, but must be {wanted}.")
@@ -88,15 +87,12 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
 
 
 def check_parameters(what: str, maker: Any, parameters: Any) -> None:
-    """Raise `InputError` unless ``parameters`` is a list of `Parameter`. ``what`` is "force" or "solver"."""
     if not isinstance(parameters, (list, tuple)) or not all(isinstance(p, Parameter) for p in parameters):
         wanted = "a list of cortado.scene.parameters.Parameter, which may be empty"
         raise InputError(f"the {what} {shown(maker)} has parameters {shown(parameters)}, but must have {wanted}.")
 
 
 def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
-    """Return all parameters of a simulation. Raise `InputError` if two parameters have the same name, or if two makers
-    replace the same force of the scene."""
     taken: dict[str, ForceMaker] = {}
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
@@ -112,7 +108,7 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
 
 
 def check_own(known: Known, source: Source) -> None:
-    """Raise `InputError` if the shape of a value does not fit the scene."""
+    """Raise `InputError` if the shape of a user-defined parameter does not fit the scene."""
     for parameter in known.own:
         shapes = parameter.shapes(0, len(source.scene.phase), source.positions.shape)
         checked_value(parameter.name, parameter.value(source), shapes, known=known)
@@ -158,7 +154,6 @@ class SolverMaker(Protocol):
 
 
 def checked_solver(solver: Any) -> SolverMaker:
-    """Return ``solver`` if it is a maker of solvers; else raise `InputError`."""
     if isinstance(solver, type) or not callable(getattr(solver, "build", None)):
         wanted = "an object with a method build(setting), which returns a solver: see docs/own_parts.md"
         raise InputError(f"solver is {shown(solver)}, but must be {wanted}.")
@@ -206,7 +201,6 @@ def forces_named(scene: Scene) -> tuple[ForceMaker, ...]:
 
 
 def known_in(scene: Scene) -> Known:
-    """Return the parameters of a scene. Raise `InputError` if two parameters have the same name."""
     own = scene.force or any(phase.rheology for phase in scene.phase) or isinstance(scene.solver, PackageSolver)
     if not (own or scene.emitter or scene.drain or moving(scene.solid)):
         return REGISTRY
@@ -310,7 +304,6 @@ def _forces(setting: Setting, makers: Sequence[ForceMaker]) -> list[Force]:
 def _parts(
     setting: SolverSetting, discretisation: Discretisation, search: NeighbourSearch, free: FreeSolids | None
 ) -> list[PartMaker]:
-    """Make the parts of a step that are not forces, in their order."""
     scene, count, phases = setting.scene, len(setting.scene.phase), Phases(1, None, 0.0)
     if count > 1:
         mobility = MOBILITIES[scene.mixture.mobility_form]

@@ -53,7 +53,7 @@ from cortado.sph.moving_solids import free_module, hold_type
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 STIFFNESS = 0.04
-"""Stiffness of contacts [-]."""
+"""Stiffness q of a contact [-]."""
 FAR = 1e6
 """Greatest distance of the search for faces [m]."""
 SHARES = ("pushes", "drags", "scales")
@@ -65,11 +65,6 @@ NUMBERS = ("time_step", "density", "other_density")
 
 @cache
 def contact_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of contacts.
-
-    ``look`` finds the depth of each surface point. ``push`` computes the momenta that each point contributes. ``give``
-    adds the sums over all points to the momenta of both solids.
-    """
     real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
     modules, stiffness = [free_module(precision, "contacts")] * 3, wp.constant(real(STIFFNESS))
 
@@ -246,7 +241,6 @@ class Contact:
         """Nearest faces above the surface points of the body."""
 
     def given(self, each: Sequence[FreeBody | Changes]) -> Arrays:
-        """Return the momenta of the two solids, or the tangents or adjoints of the momenta."""
         return given_to(each, self.touching.body, self.touching.other)
 
     def arrays(self, kinds: Mapping[str, Any]) -> Arrays:
@@ -254,8 +248,6 @@ class Contact:
 
 
 class Totals:
-    """Contributions of a body's surface points, and the sums of the contributions for each scene."""
-
     def __init__(self, contact: Contact, kinds: Mapping[str, Any], suffix: str = "", end: str = "_sum"):
         size = contact.count, contact.layout.device, contact.layout.members
         self.each = contact.arrays({f"{name}{suffix}": kind for name, kind in kinds.items()})
@@ -273,8 +265,7 @@ def share_kinds(layout: Layout) -> dict[str, Any]:
 
 class Contacts:
     def __init__(self, part: FreeSolidsPart, touching: Sequence[Touching], spacing: float, periods: Points):
-        """Prepare contacts. ``periods`` (d,) are the lengths of the periodic box [m], 0 along axes that are not
-        periodic."""
+        """``periods`` (d,) are the lengths of the periodic box [m], 0 along axes that are not periodic."""
         layout = part.layout
         self.part, self.layout, self.kernels = part, layout, contact_kernels(layout.precision)
         self.contacts = [Contact(one, spacing, layout) for one in touching if len(one.obstacles)]
@@ -296,7 +287,7 @@ class Contacts:
         self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
 
     def bodies(self, number: int) -> tuple[FreeBody, FreeBody]:
-        """Return the two free bodies of a contact. If only one solid is a free body, return it twice."""
+        """Return both free bodies of a contact. A body that touches no free body is returned twice."""
         touching, bodies = self.contacts[number].touching, self.part.bodies
         own = bodies[touching.body]
         return own, own if touching.other < 0 else bodies[touching.other]
@@ -311,8 +302,6 @@ class Contacts:
         return *known, self._poses[number], own.constants, self.lift
 
     def numbers(self, parameters: Parameters, number: int, suffix: str = "") -> Arrays:
-        """Return the parameters of the two solids by names of kernel arguments. ``suffix`` selects tangents or
-        adjoints."""
         found = {f"time_step{suffix}": parameters["time_step"]}
         for way, body in zip(("", "other_"), self.bodies(number), strict=True):
             name, weight = body.table.name, body.table.weight
@@ -372,7 +361,6 @@ class ContactsAdjoint:
         self._sums = zeros(sums, layout.device)
 
     def look(self, step: StepContext, bar: Adjoints) -> None:
-        """Convert adjoints of bodies' momenta to adjoints of their poses, their densities and the time step."""
         contacts, members = self._contacts, self._contacts.layout.members
         for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
             numbers = contacts.numbers(bar.parameters, number, "_bar")

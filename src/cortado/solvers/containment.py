@@ -27,8 +27,7 @@ NO_PARTICLE = 2**31 - 1
 
 @cache
 def bounds_type(precision: Precision) -> Any:
-    """Return the Warp struct of a container. ``up`` is the upward unit vector of an open cylinder, and 0 for other
-    containers. ``nearest`` and ``furthest`` are corners of the largest allowed box."""
+    """Return the Warp struct of a container. ``up`` is the upward unit vector of an open cylinder, else 0."""
     real = precision.real
     vectors = dict.fromkeys(("lower", "upper", "base", "across", "up", "nearest", "furthest"), precision.vector)
     return struct_of("Bounds", precision, **vectors, radius=real, rim=real)
@@ -36,12 +35,8 @@ def bounds_type(precision: Precision) -> Any:
 
 @cache
 def solids_type(precision: Precision) -> Any:
-    """Return the Warp struct of solids and their ``meshes``.
-
-    The first ``still`` solids are at rest. ``middles`` are the centres of meshes [m]. ``sides`` is 1 for fluid outside
-    a mesh and -1 for fluid inside. The arrays (members, solids) contain poses before and after a step, and scales.
-    ``period`` are the lengths of the periodic box [m].
-    """
+    """Return the Warp struct of solids, of which the first ``still`` solids are at rest. ``middles`` are the centres of
+    meshes [m]. ``sides`` is 1 for fluid outside a mesh and -1 for fluid inside."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     meshes = {"meshes": wp.array(dtype=wp.uint64), "still": wp.int32, "middles": wp.array(dtype=vector)}
     poses = dict.fromkeys(("before", "after"), wp.array2d(dtype=vector))
@@ -95,7 +90,6 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def is_deep(y: vector, k: int, scale: real, solids: solids_struct) -> bool:
-        """Test if the depth of the point ``y`` in solid ``k`` exceeds the solid's tolerance."""
         place = wp.vec3f(wp.float32(y[0]), wp.float32(y[1]), wp.float32(y[2]))
         found = wp.mesh_query_point_sign_winding_number(solids.meshes[k], place, solids.reach)
         depth = real(0.0)
@@ -114,7 +108,6 @@ def lost_kernel(precision: Precision) -> Any:
 
     @wp.func
     def has_entered(before: vector, x: vector, member: int, solids: solids_struct) -> bool:
-        """Test if a particle moved from outside all solids deep into a solid."""
         for k in range(solids.meshes.shape[0]):
             y = seen_from(x, k, member, solids.after, solids.turns, solids)
             gone = wp.length(y - seen_from(before, k, member, solids.before, solids.turns_before, solids))
@@ -140,12 +133,8 @@ def lost_kernel(precision: Precision) -> Any:
         bounds: bounds_struct, solids: solids_struct, particles: int, first_waiting: int, order, x_before, rho_0,
         x_free, v_free, x, bad_step, bad, count,
     ):  # fmt: skip
-        """Write the first lost particle of each scene to ``bad``, and the number of lost particles to ``count``.
-
-        A particle is lost if its position is not finite or too far away, if it has no volume, or if it went through a
-        wall. Fluid may flow over the rim of an open container. Particles with indices from ``first_waiting`` may pass
-        through walls when an emitter or a drain moves them.
-        """
+        """Find lost particles. Emitters and drains may move particles with indices from ``first_waiting`` through
+        walls."""
         i = wp.tid()
         member = i // particles
         if bad_step[member] >= 0:
@@ -195,8 +184,7 @@ class Containment:
     def __init__(
         self, walled: Walled, layout: Layout, launch: KernelLauncher, first_waiting: int, moving: MovingWalls | None
     ):
-        """Prepare the search for lost particles. An emitter or a drain may move particles with indices from
-        ``first_waiting``."""
+        """An emitter or a drain may move particles with indices from ``first_waiting``."""
         precision, members, device = layout.precision, layout.members, layout.device
         self.walled, self._precision, self._launch = walled, precision, launch
         self._kernel, vector, obstacles = lost_kernel(precision), precision.vector_of, (*walled.solids, *walled.moving)
@@ -239,11 +227,8 @@ class Containment:
                 array.fill_(well)
 
     def look(self, known: Named, state: State) -> None:
-        """Find lost particles at the end of a step. ``state`` is the new state.
-
-        ``known`` contains ``order``, ``x_before`` and ``rho_0`` from before the step. The new positions ``x_free`` and
-        velocities ``v_free`` in ``known`` are without the effects of emitters and drains.
-        """
+        """Find lost particles in the new ``state``. ``known`` contains ``order``, ``x_before`` and ``rho_0`` from
+        before the step, and the new positions ``x_free`` and velocities ``v_free`` before emitters and drains act."""
         found = {"bad_step": self.bad_step, "bad": self.bad_particle, "count": self._count}
         self._launch(self._kernel, self._constants, known, found, x=state.positions)
 
@@ -305,8 +290,7 @@ STEP = 1e-3
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Return a sentence about two walls with too narrow a gap at the points (n, d) [m], or None. Walls are at their
-    positions after the last step."""
+    """Return a sentence about two walls with too narrow a gap at the points (n, d) [m], or None."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [(name, one, d) for name, one in containment.walls(member) if ((d := one(points)) < best).any()]

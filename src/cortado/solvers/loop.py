@@ -25,7 +25,6 @@ UNKNOWN = 2**31 - 1
 
 @cache
 def convergence_kernels(precision: Precision, weighted: bool = False) -> SimpleNamespace:
-    """Make the kernels that count and stop iterations."""
     real, pair = precision.real, precision.pair
     module = kernel_module(f"convergence_{precision.name}{'_weighted' * weighted}")
 
@@ -47,8 +46,6 @@ def convergence_kernels(precision: Precision, weighted: bool = False) -> SimpleN
     def decide(
         done: int, most: int, particles: int, tolerance: real, greatest_tolerance: real, sums, iteration, rounds, active
     ):
-        """Add ``done`` to the number of iterations, and stop scenes that have converged or reached ``most``
-        iterations."""
         b = wp.tid()
         if rounds[b] != wp.static(UNKNOWN):
             return
@@ -72,7 +69,6 @@ def convergence_kernels(precision: Precision, weighted: bool = False) -> SimpleN
         particles: int, undecided: int, is_last: int, sums, bad, step, iteration, bad_step, rounds, active,
         iterations: wp.array2d(dtype=wp.int32), errors: wp.array2d(dtype=pair),
     ):  # fmt: skip
-        """Record the number of iterations and the errors of a loop. After the last loop, increment the step number."""
         b = wp.tid()
         n = step[b]
         iterations[n, b] = iteration[b] + undecided
@@ -97,8 +93,7 @@ def convergence_kernels(precision: Precision, weighted: bool = False) -> SimpleN
 
 
 class IterativeSolve(Protocol):
-    """Protocol of an iterative solver that belongs to a force. The attribute ``solve`` of the force is the iterative
-    solver."""
+    """Protocol of the iterative solver of a force, which is the attribute ``solve`` of the force."""
 
     name: str
     """Name of the iterations in the diagnostics of a run."""
@@ -120,8 +115,7 @@ class StepRecord:
     """Numbers of iterations and errors in each step, for a loop or for the iterative solver of a force."""
 
     def __init__(self, steps: int, layout: Layout, name: str, columns: Sequence[str] = ()):
-        """Allocate arrays for ``steps`` steps. In diagnostics, ``name`` is the name of the iterations, and ``columns``
-        are the names of the errors."""
+        """Diagnostics contain the iterations under ``name``, and the errors under ``columns``."""
         shape, kinds = (max(steps, 1), layout.members), (wp.int32, layout.precision.pair)
         self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in kinds[: 2 if columns else 1]]
         """Numbers of iterations and errors on the device (steps, members). The errors exist only with ``columns``."""
@@ -130,8 +124,7 @@ class StepRecord:
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Regard the first ``steps`` recorded steps as the last run. Recorded values are copied from the device when
-        needed."""
+        """Set the length of the last run to ``steps``. Recorded values are copied from the device when needed."""
         self._steps = steps
         self._diagnostics: dict[str, NDArray] | None = None
 
@@ -147,13 +140,11 @@ class StepRecord:
 
     @property
     def counts(self) -> NDArray:
-        """Return the number of iterations of each step (steps,). In a batch, return the greatest number over all
-        scenes."""
+        """Return the number of iterations of each step (steps,), in a batch the greatest over all scenes."""
         return self.copies[0].read(self._steps).max(axis=1)
 
     def is_within(self, limits: Mapping[str, float]) -> bool:
-        """Test if the diagnostics named in ``limits`` do not exceed their limits in the last run. A diagnostic that is
-        NaN fails the test."""
+        """Test if no diagnostic of the last run exceeds its limit in ``limits``. A NaN fails the test."""
         columns = {
             name: self.copies[1].read(self._steps)[..., k] for k, name in enumerate(self._columns) if name in limits
         }
@@ -209,8 +200,6 @@ class IterationLog:
 
 
 class Loop:
-    """A loop of iterations over all particles. The loop ends on the device when the errors are small enough."""
-
     def __init__(
         self,
         limits: LoopLimits | None,
@@ -220,12 +209,8 @@ class Loop:
         errors_name: str = "density_errors",
         weighted: bool = False,
     ):
-        """Prepare a loop. With ``limits`` None the loop has no iterations. The iterations and errors have the given
-        names in diagnostics.
-
-        If ``weighted`` is true, the errors of all particles are reduced to a weighted root mean square. Otherwise the
-        errors are reduced to average and maximum.
-        """
+        """With ``limits`` None the loop has no iterations. If ``weighted`` is true, the errors of all particles are
+        reduced to a weighted root mean square, else to average and maximum."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [errors_name] if weighted else [errors_name, f"greatest_{errors_name}"]
@@ -243,8 +228,7 @@ class Loop:
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
         """Fixed number of iterations, or 0."""
         self.bounds: dict[str, float] = {}
-        """Bounds on the reduced errors of a step that has converged, by name. With a fixed number of iterations the
-        dict is empty."""
+        """Bounds on the reduced errors, by name. With a fixed number of iterations the dict is empty."""
         if limits is not None and not is_fixed:
             self.bounds = dict(zip(self.columns, (limits.tolerance, limits.greatest_tolerance), strict=False))
         self._iteration = wp.zeros(layout.members, dtype=wp.int32, device=device)
@@ -291,7 +275,6 @@ class Loop:
             wp.capture_while(self._active, once_more)
 
     def note(self, record: StepRecord, containment: Containment, step_number: wp.array, is_last: bool) -> None:
-        """Record the iterations and errors of this step."""
         self._launch.join()
         iterations, errors = record.arrays
         own = {"bad": containment.bad_particle, "bad_step": containment.bad_step, "step": step_number}

@@ -56,8 +56,7 @@ class Walled:
     """The region for particles: the container and the solids."""
 
     region: Region
-    """Region inside the container, unbounded along periodic axes. For a solver without pressure the region is the whole
-    space."""
+    """Region inside the container, unbounded along periodic axes. Without pressure the region is the whole space."""
     near: Region
     spacing: float
     solids: tuple[Obstacle, ...]
@@ -75,8 +74,7 @@ class Walled:
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """Return the largest allowed box of particle positions. The floating-point precision may limit the size of the
-        box."""
+        """Return the largest allowed box of particle positions. A low ``precision`` may limit the box."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
@@ -144,11 +142,7 @@ class FlatFaces:
 
 
 def flat_faces(scene: Scene, support: float, most: int) -> FlatFaces:
-    """Return up to ``most`` faces of moving solids that mirror the fluid. ``support`` is the support radius [m].
-
-    Only scenes with the projection and without periodic axes have mirroring faces. Mirroring faces are long edges of
-    2-D boxes and polygons, and sides of 3-D boxes. Solids with mirroring faces have a prescribed path and free slip.
-    """
+    """Return up to ``most`` faces that mirror the fluid (`docs/projection_step.md`). ``support`` is a radius [m]."""
     found = []
     if isinstance(scene.solver, ProjectionSolver) and not np.any(scene.container.periods(scene.dimension)[1]):
         for number, table in enumerate(moving(scene.solid)):
@@ -190,8 +184,7 @@ def nozzles_of(scene: Scene, discrete: DiscreteScene) -> list[Nozzle]:
 
 
 def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> Drained | None:
-    """Return the drains of a scene, or None. Raise `InputError` if the resting positions of removed particles are too
-    far away for the precision."""
+    """Raise `InputError` if the resting positions of removed particles are too far away for the precision."""
     if not scene.drain:
         return None
     fluid, d, spacing = discrete.fluid, scene.dimension, scene.discretisation.spacing

@@ -109,8 +109,7 @@ class ParticleAdjoint:
         context.launch(self._solver.integration.begin_adjoint, *self.bar.named, v_star=v_star, **scene)
 
     def predict(self, context: StepContext, within: WithinBar | None = None) -> None:
-        """Apply the adjoint of the velocity prediction and of the forces. ``within`` contains adjoints of intermediate
-        quantities of the step, which are added."""
+        """Apply the adjoint of velocity prediction and forces, and add the adjoints ``within`` the step."""
         fields = self.bar.fields
         if within is not None:
             add(within.v_star, fields["v"])

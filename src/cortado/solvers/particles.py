@@ -43,8 +43,7 @@ class ParticleSystem:
     """Index of the first particle that an emitter or a drain may move."""
     walled: Walled
     mirrors: tuple[Points, Points]
-    """Coordinates of flat walls that mirror the fluid: lower walls (3,) and upper walls (3,) [m]; infinite without a
-    wall."""
+    """Coordinates of flat walls that mirror the fluid, lower (3,) and upper (3,) [m]; infinite without a wall."""
     faces: FlatFaces
     solids: Mapping[str, NamedSolid]
     sheets: Sheets | None
@@ -116,8 +115,7 @@ class ParticleSolver(Staying):
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return the velocity change by the pressure of the last step, or its tangent or adjoint. Return None if the
-        solver does not store the velocity change."""
+        """Return the velocity change by the last step's pressure, its tangent or adjoint; None if not stored."""
         return None
 
     def vectors(self) -> wp.array:
@@ -233,8 +231,7 @@ class ParticleSolver(Staying):
             part.end(context, new_state, moved)
 
     def end_step(self, x: wp.array, v: wp.array, new_state: State, log: IterationLog) -> None:
-        """Find lost particles, record the loops, and count the step. ``x`` and ``v`` are positions and velocities of
-        sorted particles."""
+        """Find lost particles, record the loops, and count the step. Particles are sorted."""
         f, containment = self.fields, self.containment
         before = {"order": self.search.order, "x_before": f["x"], "rho_0": f["rho_0"]}
         containment.look({**before, "x_free": x, "v_free": v}, new_state)
@@ -249,11 +246,8 @@ class ParticleSolver(Staying):
             self.launch(kernels.count_step, bad, step=self.step_number, **each)
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """Return the densities (n,) [kg / m3] of a state in scene order. For a batch, the array contains one scene
-        after the other.
-
-        Moving solids are at their poses at the end of step ``step``. The call overwrites the arrays of the solver.
-        """
+        """Return the densities (n,) [kg / m3] in scene order, for a batch one scene after the other. Moving solids are
+        at their poses at the end of step ``step``. The call overwrites the arrays of the solver."""
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():
@@ -263,8 +257,7 @@ class ParticleSolver(Staying):
         return found
 
     def pressures(self) -> wp.array | None:
-        """Return the pressure (n,) [Pa] on walls of each sorted particle in the last step. Return None for a solver
-        without pressure."""
+        """Return the pressure (n,) [Pa] on walls of each sorted particle in the last step; None without pressure."""
         return None
 
     def stresses(self) -> wp.array | None:

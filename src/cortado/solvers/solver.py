@@ -134,12 +134,10 @@ class Solver(Protocol):
         """Return the copies on the host of the arrays that `make_room` and the search for lost particles read."""
 
     def make_room(self) -> bool:
-        """Lengthen neighbour lists that were too short. Return True if steps must be repeated because of short
-        lists."""
+        """Lengthen neighbour lists that were too short. Return True if steps must be repeated for this reason."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
-        """Take one step, and record it in a ``log`` from `new_log`. ``state`` and ``new_state`` may be the
-        same object."""
+        """Take one step, and record the step in ``log``. ``state`` and ``new_state`` may be the same object."""
 
     def reserve(self, counts: Counts) -> None:
         """Allocate arrays for the intermediate values of a step with these numbers of iterations."""

@@ -44,8 +44,7 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
     @typed.kernel(discretisation.module(True, "pcisph"))
     def pressure(s, k: int, rounds, stiffness: real, time_step, n, m, rho_0, y, x_star, p_in, p_out, c, error):
-        """Write the new pressure ``p_out``. ``c`` is the new pressure divided by the squared number density. ``error``
-        gets the relative compression."""
+        """``c`` becomes ``p_out`` divided by the squared number density, ``error`` the relative compression."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if k >= rounds[member]:
@@ -113,7 +112,6 @@ def pressure_kernels(discretisation: Discretisation) -> Kernels:
 
 
 def pressure_term(d: Discretisation) -> Any:
-    """Make the Warp function for the adjoints of solids."""
     real, vector, slope = d.precision.real, d.precision.vector, pair_functions(d).slope
 
     def pressure_work(x_ij: vector, c_i: real, scaled_bar_i: vector, s: neighbourhood_type(d.precision)) -> real:

@@ -57,7 +57,6 @@ SOFTNESS = 0.2
 
 @cache
 def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the kernels of the relaxation for lighter neighbours."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, gradient = pair.weight, pair.gradient
@@ -145,7 +144,7 @@ class Pcisph(ParticleSolver):
     topic = "pcisph"
 
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
-        """Prepare the solver. With ``limits`` None there is no pressure."""
+        """With ``limits`` None there is no pressure."""
         super().__init__(system, requires_grad)
         self.limits, own = limits, self.discretisation
         self.kernels = SimpleNamespace(
@@ -158,7 +157,6 @@ class Pcisph(ParticleSolver):
         wall_y, t = self.numbers(), self.numbers()
         y = self.numbers() if self.layout.phases > 1 else wall_y
         self.known: dict[str, Any] = {"wall_y": wall_y, "t": t, "y": y, "stiffness": self.lattice.stiffness}
-        """Arrays of the relaxation factors, by names of kernel arguments."""
         self.iterates = SimpleNamespace(x_star=[], v_star=[], p=[self.numbers()], c=[])
         """Predicted states and pressures of the iterations of a step. Without derivatives, only the latest iteration is
         stored. ``p`` has the pressures before each iteration; the first is always 0."""
@@ -205,8 +203,7 @@ class Pcisph(ParticleSolver):
         return PcisphAdjoint(self, steps)
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Compute a step up to the pressure iterations: sort particles, add up forces, and predict velocities and
-        positions."""
+        """Compute a step up to the pressure iterations."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             context.launch(self.kernels.wall_relaxation.forward, y=self.known["wall_y"])
@@ -219,7 +216,6 @@ class Pcisph(ParticleSolver):
         return context
 
     def iterate(self, k: int, slot: int, context: StepContext) -> None:
-        """Compute pressure iteration ``k`` and store it in ``slot``."""
         it, before = self.iterates, max(slot - 1, 0)
         pressures = {"p_in": it.p[0] if k == 0 else it.p[max(slot - 1, 1)], "p_out": it.p[max(slot, 1)]}
         pressures |= {"x_star": it.x_star[before], "c": it.c[before], "error": self.pressure_loop.errors}

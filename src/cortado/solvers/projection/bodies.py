@@ -46,12 +46,6 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @cache
 def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the kernels of the push of particles on rigid bodies.
-
-    ``hold`` computes the push of each particle at unit pressure, and the arm of the push. ``measure`` and ``weigh``
-    compute the body's term in the diagonal of the pressure iteration. ``pull`` computes the momentum that each particle
-    gives to the body.
-    """
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair_of, pair = precision.pair, pair_functions(discretisation)
     gradient, hessian_product, separation = pair.gradient, pair.hessian_product, pair.separation
@@ -112,7 +106,7 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
 
     @particle_kernel(tangent_module, "pulled_dot twisted_dot", typed=typed)
     def pull_tangent(y_i, y_dot_i, gamma_of_i, gamma_of_dot_i, arm_i, arm_dot_i) -> tuple[vector, vector]:
-        """Write the tangents of `pull`. A generated kernel would be slower."""
+        """The generated tangent of `pull` would be slower."""
         turn = wp.cross(arm_dot_i, gamma_of_i) + wp.cross(arm_i, gamma_of_dot_i)
         return y_dot_i * gamma_of_i + y_i * gamma_of_dot_i, y_dot_i * wp.cross(arm_i, gamma_of_i) + y_i * turn
 
@@ -131,7 +125,6 @@ def body_kernels(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def motion_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels that move rigid bodies by the momenta of pressures."""
     real, vector = precision.real, precision.vector
 
     def carry(faster: vector, turned_faster: vector, gamma_of_i: vector, arm_i: vector) -> real:
@@ -213,7 +206,7 @@ class Bodies:
         return *own, *held.body.known(context), self._around
 
     def begin(self, context: StepContext, k: wp.array) -> None:
-        """Compute the push of particles on bodies at the start of a step. ``k`` are the pressures of the last step."""
+        """``k`` are the pressures of the last step."""
         self.joints.begin(context)
         for held in self.held:
             context.launch(self.kernels.hold.forward, *self.known(context, held))
@@ -225,8 +218,7 @@ class Bodies:
                 copy_each(held.sums(), held.body.pressed)
 
     def loosen(self, context: StepContext, y: wp.array) -> list[Arrays]:
-        """Write the velocities of bodies under pressures ``y`` without the effect of hinges. Return the momenta that
-        the pressures give to the bodies."""
+        """Write velocities of bodies without the effect of hinges. Return the momenta that pressures ``y`` give."""
         found = []
         for held in self.held:
             known = self.known(context, held)
@@ -236,7 +228,6 @@ class Bodies:
         return found
 
     def join(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities of bodies with hinges under pressures ``y``."""
         self.loosen(context, y)
         self.joints.join(context, self.velocities)
 
@@ -250,7 +241,6 @@ class Bodies:
         return drift
 
     def settle(self, context: StepContext, y: wp.array) -> None:
-        """Write the velocities of bodies at the end of the step under pressures ``y``."""
         self.join(context, y)
         for held in self.held:
             copy_each(held.moved, held.body.moved)
@@ -369,7 +359,7 @@ class BodiesAdjoint:
                 array.zero_()
 
     def drifted(self, context: StepContext, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of `Bodies.drifted`, and add to ``drift_bar`` and ``y_bar``."""
+        """Apply the adjoint of `Bodies.drifted`. The results are added to ``drift_bar`` and ``y_bar``."""
         self.carried(context, self.drift_bar, y, y_bar)
         add(self.drift_bar, drift_bar)
         self.drift_bar.zero_()

@@ -1,8 +1,5 @@
-"""A correction of the pressure on a coarse grid.
+"""A correction that removes the smooth part of the pressure error on a grid with nodes two spacings apart.
 
-A pressure iteration spreads a pressure by one or two spacings only. The coarse correction before an iteration removes
-the smooth part of the error, on a grid with nodes two spacings apart. The first iteration starts from the pressure of
-the last step. A coarse correction precedes the first iteration only if there is no earlier pressure.
 `docs/projection_step.md` has the equations. Takahashi and Lin (2016) describe a multilevel solver for particles.
 """
 
@@ -41,10 +38,8 @@ MOST = 1_000
 
 
 class Coarse:
-    """The coarse pressure correction of a solver: its grid, matrix and solves."""
-
     def __init__(self, system: ParticleSystem, grid: Grid, bodies: Bodies | None, endless: bool):
-        """Allocate arrays. An ``endless`` scene, with all axes periodic, has no coarse correction."""
+        """An ``endless`` scene, with all axes periodic, has no coarse correction."""
         self.endless, dimension, spacing = endless, system.walled.dimension, system.walled.spacing
         discretisation, layout = system.discretisation, system.layout
         precision, device = layout.precision, layout.device
@@ -79,14 +74,12 @@ class Coarse:
         return wp.zeros_like(self._levels.r)
 
     def room(self) -> dict[str, wp.array]:
-        """Allocate arrays for the results of a correction."""
         layout, precision = self.layout, self.layout.precision
         kept = layout.arrays(r=precision.real, change=precision.real, thrust=precision.vector)
         kept["sums"] = wp.zeros(layout.members, dtype=precision.pair, device=layout.device)
         return {**kept, "e": self.numbers()}
 
     def begin(self, context: StepContext, known: Named) -> None:
-        """Compute the coarse matrix of a step."""
         if self.endless:
             return
         scenes = {"scenes": len(self.warm), "warm": self.warm}
@@ -101,7 +94,6 @@ class Coarse:
             self.bodies.begin(context, self.grid, known, self._levels.B)
 
     def where_due(self, k: int, correct: Callable[[], None]) -> None:
-        """Call ``correct`` if iteration ``k`` needs a coarse correction."""
         if self.endless:
             return
         if k > 0:
@@ -117,8 +109,7 @@ class Coarse:
         self._levels.solve(e, self._tolerance, MOST)
 
     def correct(self, context: StepContext, k: int, known: Named, at: Named, new: Named) -> None:
-        """Correct the pressure before iteration ``k``. ``at`` contains the arrays before the correction, and ``new``
-        the arrays after the correction."""
+        """``at`` contains the arrays before the correction, and ``new`` the arrays after the correction."""
         context.launch(self.residual.forward, at, new, self.source, known)
         self.solve(context, self._none, new["e"])
         context.launch(self.pressure.correct, at, new, self.grid, known)
@@ -191,8 +182,7 @@ class CoarseAdjoint:
             array.zero_()
 
     def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
-        """Apply the adjoint of the coarse correction before iteration ``k``. ``at`` contains the adjoints before the
-        correction, and ``new`` the adjoints after the correction."""
+        """``at`` contains the adjoints before the correction, and ``new`` the adjoints after the correction."""
         own, found, known = self._coarse, self._steps, self._known
         context.launch(own.length.apply.adjoint, at, new, found, *known)
         known[0]["k_bar"].zero_()
@@ -213,7 +203,6 @@ class CoarseAdjoint:
         context.launch(own.residual.adjoint, drift, at, found, *known)
 
     def finish(self, context: StepContext) -> None:
-        """Convert the adjoints of coarse forces to adjoints of particles."""
         for kernel in self._coarse.push.adjoint:
             context.launch(kernel, self._bars, self._coarse.pushed, *self._known)
         given = {"u": self._bars["h_bar"], "slope": self._bars["N_bar"]}

@@ -44,8 +44,6 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.struct
     class Place:
-        """A node of a level, with its ``number`` and the ``shape`` of the level."""
-
         start: int
         all: int
         shape: wp.vec3i
@@ -86,7 +84,6 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def coarsen(fine: wp.vec3i, shape: wp.vec3i, factor: wp.vec3i, cells_fine: terms, cells: terms):
-        """Compute the matrix of a coarse cell from the matrices of its child cells."""
         a = wp.tid() // cells.shape[1]
         cell = wp.tid() - a * cells.shape[1]
         nodes = shape[0] * shape[1] * shape[2]
@@ -114,7 +111,6 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @typed.kernel(module)
     def fill(members: int, shapes, starts, cells, all_nodes: int, A):
-        """Write the symmetric matrices of all levels."""
         offset = wp.tid() // all_nodes
         at = place_of(wp.tid() - offset * all_nodes, members, shapes, starts)
         step, total = step_of(offset), real(0.0)
@@ -129,7 +125,6 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @typed.kernel(module)
     def weigh(members: int, shapes, starts, A, weight):
-        """Compute the Jacobi weights of the nodes of all levels."""
         at = place_of(wp.tid(), members, shapes, starts)
         own, total = A[entry(AROUND, AROUND // 2, at.number, at)], real(0.0)
         if own > real(0.0):
@@ -158,8 +153,7 @@ class Level(NamedTuple):
 
 class Levels:
     def __init__(self, layout: Layout, dimension: int, shape: tuple[int, int, int], rows: int):
-        """Allocate all levels of a grid with the given ``shape``. ``rows`` is the number of rows of the matrix `B` of
-        rigid bodies."""
+        """``rows`` is the number of rows of the matrix `B` of rigid bodies."""
         precision, members, device = layout.precision, layout.members, layout.device
         self._kernels, self._device = level_kernels(precision, dimension), device
         self._solve = solve_kernel(precision, dimension, device.is_cpu)

@@ -19,7 +19,6 @@ ALONE = 0.01
 
 @cache
 def node_functions(dimension: int) -> SimpleNamespace:
-    """Make Warp functions that number the nodes of a periodic grid and the pairs of corners of a cell."""
     flat, CORNERS = wp.constant(dimension == 2), wp.constant(2**dimension)
 
     @wp.func
@@ -62,9 +61,7 @@ def node_functions(dimension: int) -> SimpleNamespace:
 
 @cache
 def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make Warp functions that evaluate hat functions. ``at`` interpolates node values at a particle. ``products`` sums
-    the products of two node arrays over the nodes around a particle. ``bend`` multiplies mixed second derivatives by a
-    vector."""
+    """``products`` sums the products of two node arrays over the nodes around a particle."""
     real, vector = precision.real, precision.vector
     grid_type, cell_of = cell_grid_type(precision), cell_functions(precision).cell_of
     number_of, corner_step = node_functions(dimension).number_of, node_functions(dimension).corner_step
@@ -146,7 +143,6 @@ def hat_functions(precision: Precision, dimension: int) -> SimpleNamespace:
 
 @cache
 def node_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make kernels that sum over the particles around nodes, for the matrix and for the right-hand side."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     grid_type, own = cell_grid_type(precision), hat_functions(precision, dimension)
     source = bundle(s_value=real, s_slope=vector, s_bent=vector, s_own=real)

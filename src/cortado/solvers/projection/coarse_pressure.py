@@ -1,41 +1,23 @@
 """A pressure on a coarse grid of hat functions phi_I, one at each node of a `CellSort`'s grid.
 
-The equations use the share c of each particle (`cortado.solvers.projection.effects`), and N and h of
-`cortado.solvers.projection.coarse_push`:
-
-    q_iI = N_i grad phi_I(x_i) + phi_I(x_i) h_i        what the coarse pressure phi_I c pushes particle i with,
-    A_IJ = sum_i (q_iI . q_iJ + (eps + h_i^2 / 100) delta_IJ) / m_i    over the particles of the cells around I and J,
-    A e = sum_i phi_I c_i r_i,   r = D u - b where y > 0 or sigma = 1, else S (D u - b),
-    d = z - y where z = y + c_i sum_I phi_I(x_i) e_I > y-, else y- + sigma (z - y-) - y,   y- = min(y, 0),
-    y' = y + alpha d,   u' = u - alpha D^T d / m,
-    alpha = sum_i (r_i d_i + l_i) / sum_i (|D^T d|^2 / m + l_i), from 0 to 1,   l_i = m_i (1e-6 s / dt)^2.
-
-S is a smoothstep of dt (D u - b) from -1e-6 to 1e-6. S is 1 for compression and 0 for tension. Without the term l, the
-step length alpha minimises the kinetic energy along d, so that a correction never adds energy. Where the correction is
-nearly 0, as in free fall, l makes alpha 1. Before the first iteration l is only in the second sum of alpha, so that
-alpha is 0 in free fall.
-
-The constant eps makes e small at nodes with few particles. The term h^2 / 100 has the same effect. In fluid and beside
-walls that enclose the fluid, h^2 / 100 is nearly 0. Where a particle has a wall beside it and no fluid, h^2 / 100
-shortens solves.
+`docs/projection_step.md` has the equations. The share c of each particle is from `cortado.solvers.projection.effects`.
+The moment N and the push h = D^T c are from `cortado.solvers.projection.coarse_push`.
 
 Two operations transfer values between nodes and particles. The operation `spread` sums phi_I s_i + grad phi_I . t_i +
 hess phi_I : R_i + e_I o_i at a node I. The sum is over the particles i of the cells around the node, in their order.
 The operation `at` gives E = sum_I phi_I e_I at a particle, its gradient G and its mixed second derivatives. With w = (N
 G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
 
-Free bodies are included on the grid so that a light body gives way from the first step on. Pressure impulses y give a
-body the momentum F = sum_i y_i gamma_i and the angular momentum T = sum_i y_i r_i x gamma_i
-(`cortado.solvers.projection.bodies`). The body gets the velocity V = F / (rho K) and the angular velocity W = R' I^-1
-R'^T T / rho. This motion reduces the divergence of particle i by (G y)_i = gamma_i . (V + W x r_i). The matrix G is
-symmetric and positive semidefinite: y . G y is twice the kinetic energy that y gives to bodies at rest. On the grid G
-adds the matrix
+Pressure impulses y give a free body the momentum F = sum_i y_i gamma_i and the angular momentum T = sum_i y_i r_i x
+gamma_i (`cortado.solvers.projection.bodies`). The body gets the velocity V = F / (rho K) and the angular velocity W =
+R' I^-1 R'^T T / rho. This motion reduces the divergence of particle i by gamma_i . (V + W x r_i). On the grid, bodies
+add B^T B to the matrix A, with
 
-    B^T B,   B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1,
+    B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1.
 
-to the matrix A. F_I and T_I are the momenta for the pressure impulses y = phi_I c. For each body, B has three rows in
-2-D and six rows in 3-D. For a body with restricted motion, the smaller matrices of `cortado.sph.moving_solids` replace
-1 / (rho K) and I^-1.
+F_I and T_I are the momenta for the pressure impulses y = phi_I c. For each body, B has three rows in 2-D and six rows
+in 3-D. For a body with restricted motion, the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and
+I^-1.
 """
 
 from functools import cache
@@ -62,8 +44,6 @@ from cortado.sph.parts import StepContext
 
 @cache
 def coarse_pressure_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the kernels of the coarse pressure's right-hand side and of the pressure change, with tangent and
-    adjoint."""
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     grid_type, hats = cell_grid_type(precision), hat_functions(precision, dimension)
     at, products, bend, held, alone = hats.at, hats.products, hats.bend, hats.held, wp.constant(real(2.0 * ALONE))
@@ -155,15 +135,13 @@ SMALL = 1e-6
 
 @cache
 def length_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of the step length. ``share`` computes the terms of each particle in two sums. ``apply``
-    computes the new pressures and velocities."""
     real, vector, pair_of = precision.real, precision.vector, precision.pair
     small, typed = wp.constant(real(SMALL)), types_by_name(precision, {int: "first stays"})
     modules = [kernel_module(f"coarse_length_{precision.name}")] * 3
 
     @wp.func
     def length(sums: pair_of) -> real:
-        """Return the step length from two sums. If a sum is NaN, the step length is NaN."""
+        """If a sum is NaN, the step length is NaN."""
         found = sums[0] / sums[1]
         return wp.where(found <= real(0.0), real(0.0), wp.where(found >= real(1.0), real(1.0), found))
 
@@ -176,7 +154,6 @@ def length_kernels(precision: Precision) -> SimpleNamespace:
 
     @typed
     def share(first, spacing, stays, time_step, m_i, r_i, change_i, carried_i, thrust_i) -> pair_of:
-        """Return the terms of a particle in the two sums of the step length."""
         if stays != 0:
             return pair_of(real(0.0), m_i)
         v = small * spacing / time_step
@@ -215,8 +192,7 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
         grid, order, first: int, density, volume: real, inertia: matrix, half: matrix, hold, turns, x,
         of: bundle(coarse=real, gamma_of=vector, arm=vector), B: wp.array2d(dtype=real),
     ):  # fmt: skip
-        """Write a body's rows of the matrix ``B``, starting at row ``first``. ``half`` is a square root of the inverse
-        inertia."""
+        """Write rows of ``B`` from row ``first``. ``half`` is a square root of the inverse inertia."""
         node, force, torque = wp.tid(), vector(), vector()
         member = node // (grid.shape[0] * grid.shape[1] * grid.shape[2])
         for corner in range(CORNERS):
@@ -267,8 +243,6 @@ def coarse_body_kernels(precision: Precision, dimension: int) -> SimpleNamespace
 
 
 class CoarseBodies:
-    """The contribution of free bodies to the coarse matrix."""
-
     def __init__(self, bodies: Bodies, layout: Layout, dimension: int):
         precision, matrix = layout.precision, layout.precision.matrix
         self.bodies, self.kernels = bodies.at_rest(), coarse_body_kernels(precision, dimension)
@@ -286,8 +260,7 @@ class CoarseBodies:
             context.launch(self.kernels.gather, grid, own, *bodies, known, B=B, threads=B.shape[1])
 
     def carried(self, context: StepContext, y: wp.array) -> wp.array:
-        """Return the divergence that pressures ``y`` remove by moving rigid bodies. The next call overwrites the
-        result."""
+        """Return the divergence that pressures ``y`` remove by moving bodies. The next call overwrites the result."""
         return self.bodies.drifted(context, self._none, y)
 
 
@@ -317,7 +290,7 @@ class CoarseBodiesAdjoint:
         self._lifted = {name: wp.zeros_like(own.bodies.drift) for name in names}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
-        """Add the terms of rigid bodies to the adjoints. ``multiplier`` is the solution of the adjoint system."""
+        """``multiplier`` is the solution of the adjoint system."""
         kernels, (lifted, lifted_bar, carried_bar) = self._own.kernels, self._lifted.values()
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)

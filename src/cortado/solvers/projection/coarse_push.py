@@ -2,13 +2,13 @@
 
 The push h is the force of a constant pressure c, and the moment N is the force of a pressure's gradient. For a linear
 function phi, let particle j have the pressure k_j = c_j phi(x_j). With T = c L and the gradient correction L, the force
-D^T k of `cortado.solvers.projection.pressure` is exactly
+D^T k of `docs/projection_step.md` is exactly
 
     (D^T k)_i = N_i grad phi + phi(x_i) h_i,
     N_i = -sum_j (T_j g_ij) x_ij^T - sum_j' eta_j c_j g_ij' x_ij^T,
     h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij'.
 
-The images of particles j have the index j'. Their weight eta is called h in `cortado.solvers.projection.effects`.
+The images of particles j have the index j'. The page calls the weight eta of an image h.
 Inside the fluid and beside mirroring walls, N is the unit matrix and h is 0. Beside wall particles, N and h have other
 values.
 """
@@ -31,7 +31,6 @@ from cortado.sph.moment_functions import cross_terms_function, moment_functions,
 
 @cache
 def coarse_sums(discretisation: Discretisation) -> Kernels:
-    """Make the sums over neighbours for the push and the moment of a coarse pressure."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     pair = pair_functions(discretisation)
     packed, cross_terms = symmetric(precision), cross_terms_function(precision)
@@ -64,7 +63,6 @@ def coarse_sums(discretisation: Discretisation) -> Kernels:
 
 @cache
 def coarse_image_sums(discretisation: Discretisation) -> Kernels:
-    """Make the terms of mirror images in the push and the moment of a coarse pressure."""
     (real, vector, _), pair = discretisation.types, pair_functions(discretisation)
     gradient, hessian_product, typed = pair.gradient, pair.hessian_product, types_by_name(discretisation.precision)
 
@@ -160,7 +158,6 @@ CALM = 1e-6
 
 @cache
 def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the divergence that a coarse pressure has to remove."""
     precision = discretisation.precision
     real, vector, matrix, weights4 = precision.real, precision.vector, precision.matrix, weights_type(precision)
     sums = projection_sums(discretisation).velocity_gradient
@@ -183,8 +180,6 @@ def residual_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
     def residual(
         row_x, row_y, row_z, widened, time_step, n_i, L_i, gamma_i, drift_i, weights_i, image_i, coarse_i, u_i, y_i
     ) -> tuple[matrix, real, real, real, vector, vector, real]:
-        """Return the velocity gradient sums, the divergence, the residual, and the particle's terms of the right-hand
-        side."""
         A = wp.matrix_from_rows(row_x, row_y, row_z)
         D = wp.ddot(L_i, A) + wp.dot(gamma_i, u_i) - drift_i + image_i * widened
         left = D - wanted(n_i, weights_i[1], time_step)

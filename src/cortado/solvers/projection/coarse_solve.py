@@ -220,8 +220,7 @@ def system_type(precision: Precision) -> Any:
     @wp.struct
     class System:
         shapes: wp.array(dtype=wp.int32)
-        """Six numbers for each level: numbers of nodes along the axes, and ratios to the finer level's numbers of
-        nodes."""
+        """Six numbers for each level: numbers of nodes along the axes, and ratios to the finer level."""
         starts: wp.array(dtype=wp.int64)
         members: wp.int32
         team: wp.int32

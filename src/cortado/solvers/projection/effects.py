@@ -1,41 +1,15 @@
 """Weights and gradient corrections of a particle in the projection, and images of the fluid in flat mirroring walls.
 
-Weights and corrections are computed from the moments of the particle's neighbours. Images replace wall particles
-(`cortado.particles.neighbourhood`).
+`docs/projection_step.md` has the equations. M, Q and g are the moments of `cortado.solvers.projection.sums`, and gamma
+and nu are the sums of `cortado.solvers.projection.wall_sums`. With a smoothstep S of the fullness H, `weights` are
 
-M, Q and g are the moments of `cortado.solvers.projection.sums`, and gamma and nu are the sums of
-`cortado.solvers.projection.wall_sums`. H is the fullness of `cortado.sph.moment_functions`, and S(a, b) is a smoothstep
-of H from a to b. The factor B = 1 / (1 + ((nu + 9 q nu_m) / 0.05)^4) is near 0 beside walls. Here nu_m is the part of
-nu from mirroring walls, and q is near 0 beside walls without mirror. The projection uses:
+    sigma = S(0.1, 0.5) B          the part of tension that is admitted,
+    f = S(0.1, 0.5) of H + nu      the part of the previous step's pressure with which a step begins,
+    u = S(0.5, 0.8)                the part of the shift that is applied,
+    r = S(0.8, 0.95) B             the part of a low density that is repaired.
 
-    sigma = S(0.1, 0.5) B    the part of tension that is admitted; 1 in a shut scene (see `pressure`),
-    f = S(0.1, 0.5) of H + nu   the part of the previous step's pressure with which a step begins,
-    u = S(0.5, 0.8)          the part of the shift that is applied,
-    r = S(0.8, 0.95) B       the part of a low density that is repaired,
-    c = S(0.7, 0.95) of H + 2 nu   the share of a coarse pressure: 1 inside and beside walls, 0 at free surfaces,
-    L = I + c (B (K - I) + (1 - B_o) (t P - (1 + t) C)), c = S(0.2, 0.5),   which corrects gradients,
-    K = J + 0.033 S(0.8, 0.95) J (J - I), J = 1.05 (M + 0.05 I)^-1,
-    B_o = 1 / (1 + ((nu - q nu_m) / 0.05)^4), 0 beside walls without mirror; C uses their gamma,
-    C = 1.05 (P M N + N M P) / (M : N + 0.05), N = gamma gamma^T / (gamma^2 + 0.01 a_0 / 20), P = I - N,
-    t = 0.2 (1.05 / (M : P / (d - 1) + 0.05) - 1), in d dimensions,
-    a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m,   the diagonal of the projection's matrix.
-
-A wave stretches the layers of fluid beside a wall, so that they no longer match the layers of wall particles. The
-divergence D then mistakes the fluid for compressed, which damps waves and stirs still water. Mirror images always match
-the layers of fluid. Images therefore have the weight h, and particles of mirroring walls the weight 1 - h, with
-
-    h = S(0.7, 0.9) of sum V W_i' / (nu_m + 1e-6) q,   q = 1 / (1 + ((nu - nu_m) / 0.005)^4).
-
-The weight h is a smoothstep of the number density of images divided by nu_m, the number density of mirroring walls. The
-weight is 1 if the fluid beside a wall is as dense as the wall expects. The weight is 0 in spray and beside solids,
-because walls do not mirror solids. An image of particle j is at x_j' = R x_j + o, where R reflects vectors and o is an
-offset. With the kernel gradient g_i' = V grad W of the separation from the image, images add
-
-    h_i sum (v_i - R v_j) . g_i'                   to the divergence,
-    sum (h_i k_i + h_j k_j) g_i'                   to its transpose, the force,
-    h_i sum V W_i'                                 to the number density.
-
-Gradients of images are not corrected: L is the unit matrix beside mirroring walls.
+The diagonal of the projection's matrix is a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m, with the value a_0 on the
+lattice.
 """
 
 from functools import cache
@@ -52,11 +26,9 @@ from cortado.solvers.projection.wall_sums import DIRECTION, normal_part, types_b
 from cortado.sph.moment_functions import moment_functions
 
 TENSION, CORRECTED, SHIFTED, REPAIRED = (0.1, 0.5), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95)
-"""Two values of the fullness for each weight: the weight begins to grow from 0 at the first, and is 1 from the
-second."""
+"""Fullness at which each weight begins to grow from 0, and fullness from which the weight is 1."""
 SHARED = (0.7, 0.95)
-"""Two values of the fullness: the weight of the coarse pressure begins to grow from 0 at the first, and is 1 from the
-second."""
+"""Fullness at which the coarse pressure's weight begins to grow from 0, and fullness from which the weight is 1."""
 WALLED = 0.05
 """Wall coverage that halves the weights of tension, gradient correction and repairs."""
 APART = 0.005
@@ -66,8 +38,7 @@ MIRRORED = 9.0
 REGULAR = 0.05
 """Regularisation of the moment matrix before its inversion."""
 NEWTON = 0.033
-"""Factor of a Newton step towards the inverse of the moment matrix. A full step would make water at rest move
-faster."""
+"""Factor of a Newton step to the inverse moment matrix. A full step would make water at rest move faster."""
 ALONG = 0.2
 """Corrected fraction of the missing gradient along a wall. With the fraction 0, water at rest sinks along upright
 walls. With the fraction 1, the second layer of particles rises."""
@@ -75,8 +46,7 @@ walls. With the fraction 1, the second layer of particles rises."""
 
 @cache
 def away_function(precision: Precision) -> Any:
-    """Make the Warp function of a weight that is 1 away from walls and near 0 beside walls. ``half`` is the wall
-    coverage for the weight one half."""
+    """Make the Warp function 1 / (1 + (nu / half)^4), a weight that is near 0 beside walls."""
     real = precision.real
 
     @wp.func
@@ -89,7 +59,6 @@ def away_function(precision: Precision) -> Any:
 
 @cache
 def effect_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
-    """Make Warp functions of a particle's gradient correction, diagonal and weights, with derivatives."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = moment_functions(precision, dimension)
     fullness, invert, smoothstep = own.fullness, own.inverse, own.smoothstep
@@ -120,7 +89,6 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Simpl
 
     @wp.func
     def walled_correction(M: matrix, gamma: vector, least: real) -> matrix:
-        """Return the gradient correction beside a wall."""
         N = wp.outer(gamma, gamma) / (wp.dot(gamma, gamma) + direction * least)
         across = M * N - N * M * N
         P, whole = unit() - N, real(1.0) + regular
@@ -165,25 +133,15 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Simpl
 
 
 EVEN = (0.7, 0.9)
-"""Ratios of the density of images to the density of wall particles. The weight of images is 0 below the first ratio and
-1 above the second."""
+"""The weight of images grows from 0 to 1 between these ratios of image density to wall density."""
 LEAST = 1e-6
 """Smallest wall coverage that counts."""
 
 
 @cache
 def image_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the sums over mirror images of the fluid in flat walls, and over the particles of mirroring walls.
-
-    - ``weights``: density of images
-    - ``lift``: force of pressures
-    - ``echo``: adjoint of the density of images
-    - ``spread``: divergence of velocities
-    - ``sweep``: divergence by moving solids
-    - ``walls``: sums over mirroring walls
-    - ``behind``: coverage by mirroring walls
-    - ``mirror_of``: number of the walls that mirror about a position
-    """
+    """``lift`` is the force of pressures, ``echo`` the adjoint of the density of images, ``spread`` the divergence of
+    velocities, ``sweep`` the divergence by moving solids, and ``behind`` the coverage by mirroring walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
     neighbourhood, pair = neighbourhood_type(discretisation.precision), pair_functions(discretisation)
     weight, gradient, hessian_product = pair.weight, pair.gradient, pair.hessian_product
@@ -281,7 +239,6 @@ def image_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def image_share(precision: Precision, dimension: int, module: Any) -> tuple[Any, Any]:
-    """Make Warp functions of the weight of images and of its derivatives."""
     real, smoothstep = precision.real, moment_functions(precision, dimension).smoothstep
     away = away_function(precision)
     first, last, least, apart = (wp.constant(real(value)) for value in (*EVEN, LEAST, APART))

@@ -36,12 +36,7 @@ ROW = ("give", "take", "other_give", "other_take", "apart")
 
 @cache
 def joint_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of hinges, with a thread for each scene.
-
-    ``point`` and ``lean`` compute the matrices and the gap of an equation. ``weigh`` adds the term of a body to a block
-    of the system. ``read`` computes the right-hand side from velocities. ``factor`` and ``solve`` solve the system.
-    ``push`` adds the effect of the momenta to velocities.
-    """
+    """``point`` and ``lean`` compute the matrices and the gap of an equation, ``weigh`` a body's term in a block."""
     real, vector, matrix, holds = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, held = holds.spin, holds.kind
     module = kernel_module(f"joints_derivative_{precision.name}")

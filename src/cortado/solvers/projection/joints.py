@@ -23,8 +23,7 @@ BARS = ("turned_before_bar", "after_bar", "turned_bar")
 
 @dataclass(frozen=True)
 class Pair:
-    """Two equations of hinges that a body couples. The first equation is the row of a matrix block, the second the
-    column."""
+    """Two equations that contain the same body: the row and the column of a matrix block."""
 
     block: tuple[int, int]
     body: int
@@ -50,8 +49,7 @@ class JointArrays:
         self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:
-        """Return the two matrices ``give`` and ``take`` of equation ``k``. If ``other`` is true, the matrices are for
-        the second solid of the hinge, else for the first solid."""
+        """Return ``give`` and ``take`` of equation ``k``, of the second solid of the hinge if ``other`` is true."""
         way = "other_" if other else ""
         return {f"{name}{self._suffix}": self.rows[k][f"{way}{name}{self._suffix}"] for name in ("give", "take")}
 
@@ -75,8 +73,7 @@ class Row:
 
     @property
     def sides(self) -> list[tuple[int, bool]]:
-        """Return the number of each free body in the equation, with a flag that is True for the second solid of the
-        hinge."""
+        """Return the number of each free body in the equation, and True if the body is the hinge's second solid."""
         return [(body, other) for body, other in ((self.joint.body, False), (self.joint.other, True)) if body >= 0]
 
 
@@ -124,7 +121,6 @@ class Joints:
             yield k, row, self.kernels.point if row.share else self.kernels.lean, (self.own.rows[k], known, named)
 
     def weighed(self, step: StepContext) -> Iterator[tuple[Pair, tuple[Named, ...]]]:
-        """Yield `pairs` with the arguments of the kernel ``weigh``."""
         for pair in self.pairs:
             row, column = (self.rows[k] for k in pair.block)
             own = {"row_share": row.share, "share": column.share, "sign": 1.0 if pair.far[0] == pair.far[1] else -1.0}
@@ -134,14 +130,12 @@ class Joints:
             yield pair, (self.own.sides(pair), own, self.own.blocks[pair.block], *body)
 
     def read(self, moved: Sequence[Arrays]) -> Iterator[tuple[int, Row, tuple[Named, ...]]]:
-        """Yield the equations with the arguments of the kernel ``read``. ``moved`` are velocities of bodies."""
         for k, row in enumerate(self.rows):
             numbers = {"share": row.share, "is_free": row.joint.other >= 0}
             yield k, row, (velocities(row, moved), self.own.rows[k], self.own.entries[k], numbers)
 
     def ends(self, step: StepContext, moved: Sequence[Arrays]) -> Iterator[tuple[int, int, bool, tuple[Named, ...]]]:
-        """Yield equation number, body number, a flag that is True for the second solid of the hinge, and the arguments
-        of ``push``."""
+        """Yield equation number, body number, True for the second solid of the hinge, and arguments of ``push``."""
         for k, row in enumerate(self.rows):
             for body, other in row.sides:
                 signs, own = {"share": row.share, "sign": -1.0 if other else 1.0}, self.part.bodies[body].known(step)
@@ -158,14 +152,13 @@ class Joints:
             step.launch(self.kernels.factor, *factors, rows=len(self.rows), threads=self.layout.members)
 
     def solve(self, step: StepContext, wanted: wp.array, pushes: wp.array, transposed: int = 0) -> None:
-        """Solve for the momenta ``pushes`` of hinges, given the right-hand side ``wanted``. ``transposed`` 1 selects
-        the transposed system."""
+        """``transposed`` 1 selects the transposed system."""
         known = {"rows": len(self.rows), "transposed": transposed, "wanted": wanted, "pushes": pushes}
         if self.rows:
             step.launch(self.kernels.solve, self.factors, known, threads=self.layout.members)
 
     def find(self, step: StepContext, moved: Sequence[Arrays]) -> None:
-        """Compute the momenta of hinges. ``moved`` are the velocities of bodies without hinges."""
+        """``moved`` are the velocities of bodies without hinges."""
         for _, _, known in self.read(moved):
             step.launch(self.kernels.read.forward, *known, threads=self.layout.members)
         self.solve(step, self.own.whole["wanted"], self.own.whole["pushes"])
@@ -181,7 +174,6 @@ class Joints:
 
 
 def velocities(row: Row, moved: Sequence[Arrays], suffix: str = "") -> Arrays:
-    """Return the velocity changes of an equation's two solids, by argument names of the kernel ``read``."""
     own = moved[row.joint.body]
     other = own if row.joint.other < 0 else moved[row.joint.other]
     names = [f"{name}{suffix}" for name in ("faster", "turned_faster")]

@@ -28,16 +28,14 @@ class ProjectionConstants:
     """Smoothing kernel at a distance of one spacing, times the volume of a particle [-]."""
 
     def repair_relaxations(self, repairs: int) -> list[float]:
-        """Return the relaxation factor of each repair, from the roots of a Chebyshev polynomial (Golub and
-        Varga 1961)."""
+        """Return the relaxation factors of repairs, from roots of a Chebyshev polynomial (Golub and Varga 1961)."""
         middle, half = 0.5 * (1.0 + SMOOTHED), 0.5 * (1.0 - SMOOTHED)
         roots = np.cos(np.pi * (np.arange(repairs) + 0.5) / repairs)
         return [self.relaxation / float(middle - half * root) for root in roots]
 
 
 def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
-    """Compute the constants on the rest lattice of a scene. The relaxation factor makes the Jacobi iteration stable for
-    the stiffest pressure wave."""
+    """The relaxation factor makes the Jacobi iteration stable for the stiffest pressure wave on the rest lattice."""
     kernel, spacing, dimension = discrete.kernel, scene.discretisation.spacing, scene.dimension
     support = discrete.lattice.support
     offsets = lattice_offsets(spacing, support, dimension)
@@ -60,11 +58,8 @@ def endless(discrete: DiscreteScene) -> bool:
 
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
-    """Make the periodic grid of the coarse correction around the region of the particles.
-
-    The number of nodes along each axis is 4 to 7 times a power of two, so that coarser levels can halve it. Nodes lie
-    on the lower walls of a container.
-    """
+    """Along each axis the grid has 4 to 7 times a power of two nodes, so that coarser levels can halve the number.
+    Nodes lie on the lower walls of a container."""
     reach, most = SPACING * scene.discretisation.spacing, max(4 * particles, 512)
     grid = Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)
     cell, shape = grid.cell.copy(), [*grid.shape]

@@ -1,25 +1,14 @@
 """Values from a step of the projection: the pressure that a gauge reads, and the forces on mirroring walls.
 
-Let k_i be the multiplier of particle i, L the gradient correction, and T = k L. Particle j pushes particle i with the
-force -V (T_i + T_j) g_ij / dt. Wall particle b pushes particle i with -V k_i b_ib / dt, where b_ib is the term of b in
-gamma_i. The momentum flux of these forces is spread evenly along the line between two particles, or to the surface
-point s_b of the wall (Irving and Kirkwood 1950):
+`docs/projection_step.md` has the equation of the pressure. Kernels divide impulses, which are k or dt p, by the time
+step.
 
-    dt p_i = (-1/2 sum_j x_ij . (T_i + T_j) g_ij - k_i r_i) / d,   r_i = sum_b b_ib . (x_i - s_b),
+On mirroring walls, the forces of images replace the fraction h of the forces on wall particles. The change of the force
+is the sum over the images by one solid or by all walls
 
-in d dimensions. Images have the weight h and mirroring walls the weight 1 - h (`cortado.solvers.projection.effects`).
-The multiplier k / dt scatters among uneven particles. Beside a wall, where neighbours are missing, the multiplier is
-not a stress.
+    sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m
 
-Kernels divide impulses, which are k or dt p, by the time step.
-
-Mirroring walls get the forces of `cortado.solvers.projection.wall_sums` and also the forces of images. The forces of
-images replace the fraction h of the forces on the particles of mirroring walls. The change of the force is
-
-    sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m,
-
-summed over the images by one solid or by all walls. Here gamma_m is the part of gamma from mirroring wall particles.
-Walls receive exactly the momentum that the fluid loses to them.
+with the part gamma_m of gamma from mirroring wall particles.
 """
 
 from dataclasses import replace
@@ -52,9 +41,6 @@ TOPIC = "mean_stress"
 
 
 class MeanStress:
-    """The mean normal stress of sorted particles in a step, with derivatives. ``known`` are kernel arguments
-    by name."""
-
     def __init__(self, system: ParticleSystem):
         discretisation, layout = system.discretisation, system.layout
         self._faces, self._kernels = FaceShares(system), mean_stress_kernels(discretisation, system.walled.dimension)
@@ -72,15 +58,13 @@ class MeanStress:
         return found
 
     def tangent(self, context: StepContext, dot: Tangents, *known: Named) -> NDArray:
-        """Return the tangent (n,) of the mean normal stress times the time step."""
         found, walls = self._arrays["q"], self._totals(context, known)
         dots = {f"{name}_dot": one.tangent(context, dot, ALL_WALLS, *known) for name, one in self._walls.items()}
         context.launch(self._kernels.tangent, walls, dots, *dot.named, *known, q_dot=found)
         return np.array(found.numpy())
 
     def adjoint(self, context: StepContext, bar: Adjoints, at: Named, *known: Named) -> None:
-        """Add to the adjoints of pressures and particles, given the adjoint ``q_bar`` of the mean normal stress in
-        ``at``."""
+        """``at`` contains the adjoint ``q_bar`` of the mean normal stress times the time step."""
         (own, pairs), reach_bar = self._kernels.adjoint, self._arrays["reach_bar"]
         context.launch(own, self._totals(context, known), *bar.named, at, *known, reach_bar=reach_bar)
         context.launch(pairs, *bar.named, at, *known)
@@ -199,7 +183,6 @@ def pressed_kernels(precision: Precision) -> Kernels:
 
 @cache
 def image_load_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of forces of images on the walls of a solid."""
     real, vector, _ = discretisation.types
     module, tangent_module, adjoint_module = discretisation.modules("image_loads")
     load, load_tangent, load_back = map(image_sum_of_solid, image_sums(discretisation).lift)

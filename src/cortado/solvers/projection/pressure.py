@@ -1,28 +1,9 @@
 """The pressures of the projection, by accelerated Jacobi iterations that admit only part of the tension.
 
-Let k = dt p be the pressure impulses. With wall velocities v_b, the divergence D and its transpose, the force, are
-
-    (D v)_i = L_i : A_i + gamma_i . v_i - sum_b gamma_ib . v_b,   A_i = sum_j v_ij g_ij^T,
-    (D^T k)_i = sum_j (k_i L_i + k_j L_j) g_ij + k_i gamma_i,
-
-with the kernel gradient g_ij, its correction L_i, and the sum gamma_i over walls. Mirror images add terms to the
-divergence and to the force (`cortado.solvers.projection.effects`). An iteration begins with y, an extrapolation of k
-(Nesterov 1983), and computes
+`docs/projection_step.md` has the equations of the divergence D and of its transpose, the force. An iteration computes
 
     v = v* - D^T y / m,   z+ = y + omega (D v - b) / a,   z- = y + omega D v / a,
     k' = z+ if z+ > 0;  sigma z- if z- < 0;  else 0,   y' = k' + beta (k' - k).
-
-Here a is the diagonal of the matrix, omega the relaxation factor and beta the momentum. The term b = (1 - f) max(1 - n,
-0) / dt lets scattered fluid come together before pressure resists. n is the number density, and the weight f is 0 for
-scattered particles. The factor sigma, which is near 1 for surrounded particles, admits tension. The resulting velocity
-is v* - D^T k / m.
-
-A step begins with the pressure of the previous step. The first k is f times the last k. The first v is v* + f w, with
-the velocity change w = -D^T k / m of the previous step.
-
-A particle begins without pressure, and with the velocity v*, if w would move it more than a tenth of a spacing towards
-a wall. Otherwise, between walls less than a spacing apart, the pressure from one wall would throw a particle at the
-other wall, harder in each step. The choice of these particles has no derivative.
 
 A scene is shut if it has no free surface: the weight c of the coarse pressure is positive for every particle. In a shut
 scene tension is also admitted beside walls, sigma = 1, because fluid that fills a container cannot leave the walls.
@@ -52,7 +33,6 @@ from cortado.sph.moment_functions import symmetric
 
 @cache
 def clamp_functions(precision: Precision) -> SimpleNamespace:
-    """Make Warp functions that limit tension."""
     real = precision.real
 
     @wp.func
@@ -107,8 +87,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     def update(
         s, omega: real, beta: real, time_step, x, n, of: shared, at, k_out, y_out, T, error: wp.array(dtype=pair_of)
     ):
-        """Compute a pressure iteration: the divergence of velocities, the new pressures, and the ``error`` of each
-        particle."""
         i = s.first + wp.tid() // LANES
         row_x, row_y, row_z = gradient(i, x, at.u, s)
         widened = spread(i, x, at.u, s)
@@ -170,7 +148,6 @@ def pressure_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     def clamp_adjoint(
         particles: int, omega: real, beta: real, time_step, n, of, at: iterate, k_bar, y_bar, bar, d_bar, S
     ):
-        """Convert the adjoints of new pressures to adjoints of old pressures and of the divergence."""
         i = wp.tid()
         dt = time_step[i // particles]
         D, full, a = at.d[i], of.weights[i][1], of.a[i]
@@ -242,7 +219,6 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def start(
         spacing, time_step, k_before_i, kick_before_i, weights_i, beside_i, surfaced, v_star_i
     ) -> tuple[weights4, real, real, vector]:
-        """Return the weights, the pressures and the velocity of a particle at the start of the iterations."""
         full, tension = weights_i[1], weights_i[0]
         if wp.dot(kick_before_i, beside_i) > real(0.0) and time_step * wp.length(kick_before_i) > towards * spacing:
             full = real(0.0)
@@ -258,8 +234,7 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def begin(
         particles: int, spacing: real, time_step, k_before, kick_before, beside, v_star, surfaced, weights, first, warm
     ):
-        """Write the weights, pressures and velocities at the start of the iterations. Set ``warm`` to 1 in scenes with
-        a pressure."""
+        """Write the values at the start of the iterations. Set ``warm`` to 1 in scenes with a pressure."""
         i, member = wp.tid(), wp.tid() // particles
         kept, pressure, _same, velocity = begun(
             spacing, time_step[member], k_before[i], kick_before[i], weights[i], beside[i], surfaced[member], v_star[i]

@@ -1,19 +1,8 @@
-"""Repairs of the density, by Jacobi iterations that change only positions. The iterations begin at x', the positions
-after the shift:
+"""Repairs of the density, by Jacobi iterations that change only positions.
 
-    lambda' = z if z > 0, else r z,   z = lambda + omega_k (n(x_k) - 1) / a,
-    d = -(sum_j (lambda'_i + lambda'_j) g_ij + lambda'_i gamma_i) / m,   x_k+1 = x' + d min(1, s / 6 |d|),
-
-with multipliers lambda, displacements d, the number density n and the mass m of a particle divided by its volume.
-Mirror images contribute to n and to d (`cortado.solvers.projection.effects`).
-
-A displacement is at most a sixth of a spacing s. Where walls leave no room, unbounded repairs would throw a particle
-through a wall.
-
-Iteration k has its own relaxation factor omega_k (`cortado.solvers.projection.lattice`). Velocities are not changed,
-because a repair would then act a second time in the next step. The factor r of `cortado.solvers.projection.effects`
-restricts repairs of low densities to the interior. The kernel gradients g_ij, the wall sums gamma_i and the diagonal a
-are from the start of the step. Only n is computed at the positions x_k, over the neighbours from the start of the step.
+`docs/projection_step.md` has the equations. Kernel gradients, wall sums and the diagonal are from the start of the
+step. Only the number density is computed at the moved positions, over the neighbours from the start of the step.
+Repairs do not change velocities, because a repair would then act a second time in the next step.
 """
 
 from functools import cache
@@ -61,8 +50,7 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
     @typed.kernel(module)
     def measure(s, omega: real, of, x_now, c_in, c_out, excess, error: wp.array(dtype=pair_of)):
-        """Compute the multipliers of a repair from densities. ``c_in`` are the old and ``c_out`` the new multipliers,
-        ``excess`` is the density error."""
+        """``c_in`` are the old and ``c_out`` the new multipliers, ``excess`` is the density error."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x_now, s)
         surplus = image_weights(i, x_now, s) - behind(i, x_now, mirror_of(x_now[i], i // s.particles, s), s)
@@ -161,7 +149,6 @@ def repair_kernels(discretisation: Discretisation, dimension: int) -> SimpleName
 
 
 def repair_term(d: Discretisation) -> Any:
-    """Make the Warp function for the adjoints of solids, given adjoints of the density."""
     real, vector, weight = d.precision.real, d.precision.vector, pair_functions(d).weight
 
     def repair_work(

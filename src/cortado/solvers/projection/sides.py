@@ -40,8 +40,6 @@ NONE = -1
 
 @cache
 def side_kernels(precision: Precision) -> Kernels:
-    """Make the kernels that keep particles on their side of a sheet. ``least`` is the smallest distance from a
-    sheet."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     neighbourhood, sheets_of = neighbourhood_type(precision), sheets_type(precision)
     (scale_of, seen_from), (query, meets, goes_through) = sheet_functions(precision), face_functions(precision)
@@ -201,8 +199,6 @@ def side_kernels(precision: Precision) -> Kernels:
 
 
 class Sides:
-    """Keeps the particles of a solver on their sides of all sheets."""
-
     def __init__(self, sheets: Sheets, spacing: float, layout: Layout):
         self._kernels, self._sheets, count = side_kernels(layout.precision), sheets, len(sheets.numbers)
         self._known: dict[str, Any] = {"sheets": sheets.struct, "least": NEAREST * spacing}
@@ -212,8 +208,7 @@ class Sides:
         self._none = layout.arrays("_bar", **share_kinds(layout.precision))
 
     def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
-        """Return the positions (n,) of sorted particles after a correction at sheets. ``x_now`` are the positions
-        before the correction."""
+        """Return corrected positions (n,) of sorted particles. ``x_now`` are the positions before the correction."""
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
             x_now = x_kept

@@ -47,7 +47,6 @@ class ProjectionTangent(ParticleTangent):
             **{"v_end_dot": v_end, **layout.arrays(T=precision.six)},
             **{"k_before_dot": self.carried_dot[IMPULSE], "kick_before_dot": self.carried_dot[KICK]},
         }
-        """Tangents by names of kernel arguments."""
         self._around = self.density.around
         self._known = self._own, *self.dot.named, self._around, solver.known
         self._bodies = None
@@ -136,7 +135,6 @@ class ProjectionAdjoint(ParticleAdjoint):
             **layout.arrays(f=precision.vector, S=precision.six, T=precision.six),
             "v_star_bar": self.bar.fields["v"],
         }
-        """Adjoints by names of kernel arguments."""
         self.bar = replace(self.bar, kick=own["kick_before_bar"])
         self._around = self.density.around
         self._known = self._own, *self.bar.named, self._around, solver.known
@@ -154,7 +152,6 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.step(counts, state_bar, parameters, within)
 
     def _press(self, context: StepContext, k: wp.array, within: WithinBar) -> None:
-        """Add the adjoints of pressures ``within`` the step to the adjoints of the last pressures ``k``."""
         solver, own = self._solver, self._own
         pressed = pressed_kernels(solver.layout.precision).adjoint
         context.launch(pressed, *self._known, impulse=k, p_bar=within.p, impulse_bar=own["k_bar"])
@@ -225,8 +222,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         self.bar.solids.add(context.launch, densities, *known, x=at["x_now"])
 
     def _iterate(self, context: StepContext, k: int, moves: bool) -> None:
-        """Apply the adjoint of a pressure iteration. ``moves`` is true if the shift uses the velocity gradients of the
-        iteration."""
+        """``moves`` is true if the shift uses the velocity gradients of the iteration."""
         solver, own, known = self._solver, self._own, self._known
         velocity, pressure = solver.kernels.velocity, solver.kernels.pressure
         (clamp, divergence, whole), more = pressure.update.adjoint, dict[str, wp.array]()
@@ -272,7 +268,7 @@ class Maker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Make the projection solver. Without pressure, make PCISPH, which then takes equal steps."""
+        """Without pressure, make PCISPH, which then takes equal steps."""
         system, table, batch = particle_system(setting), self._table, setting.batch
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)

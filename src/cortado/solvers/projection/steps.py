@@ -1,32 +1,13 @@
 """A step of the projection: pressures that make velocities divergence-free, a shift of particles, and repairs of the
 density.
 
-A step moves particles by dt v and by the shift delta, repairs densities, and optionally corrects velocities.
-
-Particles of the interior are shifted towards regions with fewer particles (Lind et al. 2012; Skillen, Lind, Stansby and
-Rogers 2013). Pairs of particles that are nearer than 0.65 s, with the spacing s, are moved apart everywhere. The rate r
-increases with the velocity gradient and the tension, so that the shift does not stir a fluid at rest:
-
-    delta = r (4 sum_j p_ij - s^2 u P grad C),   p_ij = max(1 - |x_ij|^2 / (0.65 s)^2, 0)^2 x_ij,
-    grad C = sum_j (1 + q_ij / (4 + q_ij)) g_ij + gamma,   q_ij = (W_ij / W(s))^4,
-    r = 20 dt |grad v| + 60 c^2 / (c + 0.004)^1.5,   c = w dt^2 max(-p, 0) / (rho s^2).
-
-Here C is the concentration of particles, g_ij the kernel gradient, and gamma the sum over walls. Smooth bounds limit r
-to 0.5 and |delta| to 0.1 s. Under tension particles clump (the tensile instability, Monaghan 2000), so the shift is
-faster there. P projects out the direction of the surface, g + gamma, where g is the sum of g_ij. The weights u and w
-are from `cortado.solvers.projection.effects`: u is 0 at surfaces, and w, the weight of repairs of low densities, is 0
-near surfaces and beside walls. The shift does not change velocities, because a correction by (delta . grad) v adds
-energy.
-
-With ``velocities_follow`` velocities follow, to first order, the positions after the shift and the repairs (Xu, Stansby
-and Laurence 2009):
+`docs/projection_step.md` has the equations of the pressure, the shift delta and the repairs. With ``velocities_follow``
+velocities follow, to first order, the positions after the shift and the repairs (Xu, Stansby and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
 where M is the moment matrix, I the unit matrix, and x_K are the positions after the last repair. A is from the last
 iteration of the pressure.
-
-The repairs of the density begin from x + dt v + delta.
 """
 
 from functools import cache, cached_property
@@ -108,7 +89,6 @@ def shift_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def following_kernels(d: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels that correct velocities for the shift and the repairs."""
     precision, modules = d.precision, d.modules(f"projection_following_{dimension}d")
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     inverse = effect_functions(precision, dimension, modules[0]).inverse
@@ -122,7 +102,6 @@ def following_kernels(d: Discretisation, dimension: int) -> Kernels:
 
 @cache
 def moving_kernels(precision: Precision) -> Kernels:
-    """Make the kernels that move particles before the first repair."""
     modules = [integration_module(precision, forward, topic="moving") for forward in (True, False, False)]
     real, vector = precision.real, precision.vector
 
@@ -149,8 +128,7 @@ class ProjectionSteps(ParticleSolver):
     def __init__(
         self, system: ParticleSystem, table: ProjectionSolver, constants: ProjectionConstants, grid: Grid, endless: bool
     ):
-        """Prepare steps with the settings in a scene's ``table``. The ``grid`` is for the coarse pressure correction.
-        An ``endless`` scene, with all axes periodic, has no coarse correction."""
+        """An ``endless`` scene, with all axes periodic, has no coarse correction on the ``grid``."""
         self.constants, repairs = constants, table.repairs
         limits = LoopLimits(table.iterations, table.iterations, 0.0, 0.0)
         if table.tolerance is not None:
@@ -170,8 +148,7 @@ class ProjectionSteps(ParticleSolver):
         self._iterate_kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._repair_kinds = {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates: list[dict[str, wp.array]] = []
-        """Velocities, velocity gradients, divergences and pressures before each iteration. The last element of the list
-        contains the result."""
+        """Values before each pressure iteration. The last element of the list contains the result."""
         self.corrected: list[dict[str, wp.array]] = []
         """Velocities and pressures after each coarse correction."""
         self.repaired: list[dict[str, wp.array]] = []
@@ -185,9 +162,7 @@ class ProjectionSteps(ParticleSolver):
             **{"k_before": self.carried[IMPULSE], "kick_before": self.carried[KICK]},
             "surfaced": self.density.surfaced,
         }
-        """Arrays and constants by names of kernel arguments."""
         self.sides = None if system.sheets is None else Sides(system.sheets, constants.spacing, self.layout)
-        """Keeps particles on their sides of sheets; None without sheets."""
         self.following = following_kernels(*own) if table.velocities_follow else None
         free = [part for part in self.parts if isinstance(part, FreeSolidsPart)]
         self.bodies = Bodies(free[0], self.discretisation, self.density.around) if free else None
@@ -270,7 +245,7 @@ class ProjectionSteps(ParticleSolver):
         return self._context.parameters
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Compute a step up to the pressure iterations: sort particles, add up forces, and predict velocities."""
+        """Compute a step up to the pressure iterations."""
         context = self.sort(state, parameters)
         if self.bodies is not None:
             self.bodies.begin(context, self.carried[IMPULSE])
@@ -281,7 +256,7 @@ class ProjectionSteps(ParticleSolver):
         return context
 
     def iterate(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Compute pressure iteration ``k``. ``before`` and ``after`` are indices into `iterates`."""
+        """``before`` and ``after`` are indices into `iterates`."""
         old, at, new = self.iterates[before], self.corrected[before], self.iterates[after]
 
         def correct() -> None:
@@ -318,7 +293,7 @@ class ProjectionSteps(ParticleSolver):
         return {"k": end["k"], "v_new": end["u"], "A": self.corrected[max(slot - 1, 0)]["A"]}
 
     def mend(self, context: StepContext, k: int, before: int, after: int) -> None:
-        """Compute repair ``k``. ``before`` and ``after`` are indices into `repaired`."""
+        """``before`` and ``after`` are indices into `repaired`."""
         kernels, at, new = self.kernels.repair, self.repaired[before], self.repaired[after]
         measured = {"c_in": at["c"], "c_out": new["c"], "omega": self.repair_relaxations[k]}
         context.launch(kernels.measure.forward, measured, at, self.known, error=self.loops[1].errors)

@@ -67,7 +67,7 @@ def projection_sums(discretisation: Discretisation) -> SimpleNamespace:
 
     @wp.func
     def closeness(near: real) -> real:
-        """Return the weight of a pair in the shift. It grows for close pairs."""
+        """Return the weight of a pair in the shift, which grows as the pair gets closer."""
         q = near * near * near * near
         return real(1.0) + crowded * q * reciprocal(real(1.0) + real(0.25) * q)
 
@@ -211,7 +211,6 @@ def velocity_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
     @particle_kernel(module, "kick u", both, typed=typed)
     def velocity(total, lifted, m_i, y_i, T_i, g_i, gamma_i, v_star_i) -> tuple[vector, vector]:
-        """Return the velocity change by pressures, and the new velocity."""
         change = -(total + lifted + times(T_i, g_i) + y_i * gamma_i) / m_i
         return change, v_star_i + change
 

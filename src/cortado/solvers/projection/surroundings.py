@@ -31,7 +31,6 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 
 def bar_entries(precision: Precision) -> dict[str, Any]:
-    """Return the Warp types of the adjoints of surroundings by name."""
     return {name: kind for name, kind in entries(precision).items() if name != "Q"}
 
 
@@ -64,7 +63,7 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
     @typed.kernel(module)
     def surroundings(s, least: real, per_nearest: real, per_apart: real, x, v, m, n, of, surfaced: wp.array(dtype=int)):
-        """Write the surroundings of all particles. Set ``surfaced`` to 1 in scenes with a free surface."""
+        """Set ``surfaced`` to 1 in scenes with a free surface."""
         i = s.first + wp.tid() // LANES
         diagonal, others, square, mixed, g, crowd, apart, near = moments(i, x, m, per_nearest, per_apart, s)
         normal, entire, nu, normal_drift, whole_drift = beside(i, x, v, s)
@@ -237,8 +236,6 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
 
 
 class Surroundings(Density):
-    """Computes the number density, the moments and the wall sums of particles."""
-
     def __init__(self, system: ParticleSystem, topic: str, constants: ProjectionConstants):
         kernels = surrounding_kernels(system.discretisation, system.walled.dimension)
         super().__init__(system.discretisation, topic, kernels)

@@ -1,20 +1,8 @@
 """Sums over walls for the force of walls on a particle in the projection, with derivatives.
 
-Wall particle b has the weight w_b, the normal n_b and the kernel gradient g_ib = V grad W_ib. The part of g_ib along
-the normal is n_b n_b^T g_ib. The sums over wall particles are
-
-    normal = sum w_b n_b n_b^T g_ib,   whole = sum w_b g_ib,   nu = V sum w_b W_ib,
-
-and for moving walls with velocities v_b the drifts sum w_b (n_b n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The walls
-push along
-
-    gamma = normal + e (whole - normal),   e = S(0.1, 0.4) of (whole^2 - normal^2) / (whole^2 + 0.01 a_0 / 20),
-
-where S(0.1, 0.4) is a smoothstep from 0.1 to 0.4. Along a flat wall and in a concave corner the edge factor e is 0, so
-that the arrangement of wall particles causes no friction. At an edge that protrudes into the fluid, ``normal`` is only
-a third of the missing sum, and e is 1.
-
-The pressure of a particle pushes the walls of one solid s along gamma_s / V,
+`docs/projection_step.md` has the equations. The code names gamma_n ``normal`` and gamma_w ``whole``, so that gamma =
+normal + e (whole - normal) with the edge factor e. For moving walls with velocities v_b, the drifts are sum w_b (n_b
+n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The pressure of a particle pushes the walls of one solid s along gamma_s / V,
 
     gamma_s = normal_s + e (whole_s - normal_s).
 
@@ -56,15 +44,13 @@ from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
-"""Limits of the fraction of the wall gradient that is not along normals. Below the first limit a wall counts as flat,
-above the second limit as an edge."""
+"""Fraction of the wall gradient across the normals: a wall is flat up to the first, and an edge from the second."""
 DIRECTION = 0.01
 """Relative size of the wall gradient below which the direction of a wall is unknown."""
 
 
 @cache
 def edge_functions(precision: Precision, dimension: int, module: Any) -> SimpleNamespace:
-    """Make Warp functions of the factor for edges of walls, with derivatives."""
     real, vector, smoothstep = precision.real, precision.vector, moment_functions(precision, dimension).smoothstep
     e_0, e_1, direction = (wp.constant(real(value)) for value in (*EDGED, DIRECTION))
 
@@ -83,8 +69,7 @@ def edge_functions(precision: Precision, dimension: int, module: Any) -> SimpleN
 
 @cache
 def normal_part(discretisation: Discretisation) -> Any:
-    """Make the Warp function that projects a vector on the normal of a wall. ``foot`` points from a wall particle to
-    the surface."""
+    """``foot`` points from a wall particle to the surface."""
     vector = discretisation.precision.vector
 
     @wp.func
@@ -137,7 +122,6 @@ def _normal_work(d: Discretisation) -> Any:
 
 
 def beside_term(d: Discretisation) -> Any:
-    """Make the Warp function for the adjoints of solids, given adjoints of the sums over walls."""
     real, pair, normal = d.precision.real, pair_functions(d), normal_part(d)
     weight, gradient = pair.weight, pair.gradient
 
@@ -156,7 +140,6 @@ def beside_term(d: Discretisation) -> Any:
 
 @cache
 def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
-    """Make the kernels of the force of pressure on a solid."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
 
@@ -174,8 +157,6 @@ def push_kernels(discretisation: Discretisation, dimension: int) -> Kernels:
 
 
 class ProjectionPush:
-    """The action of walls on particles through pressures in the projection."""
-
     def __init__(self, system: ParticleSystem, constants: ProjectionConstants):
         discretisation, layout = system.discretisation, system.layout
         self._kernels, self._layout = push_kernels(discretisation, system.walled.dimension), layout
@@ -225,7 +206,6 @@ NUMBERS = ("image", "density", "weighted", "spread", "swept", "k", "q")
 
 @cache
 def face_share_kernel(discretisation: Discretisation) -> Any:
-    """Make the kernel that converts adjoints of image sums to adjoints of a solid."""
     d = replace(discretisation, lanes=1, taped=True)
     precision = d.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
@@ -325,8 +305,7 @@ class FaceShares:
         self._nothing = system.layout.arrays(**kinds) if self._faces else {}
 
     def add(self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: Any) -> None:
-        """Add the terms of images in all walls, or in the walls of the solid ``over``. Missing ``arrays``
-        count as 0."""
+        """Add the terms of images in all walls or in the solid ``over``. Missing ``arrays`` count as 0."""
         if self._faces:
             known = {**self._nothing, **{name: array for group in groups for name, array in group.items()}, **arrays}
             bar.solids.add(context.launch, self._kernel, *bar.named, known, over=over)
@@ -338,8 +317,7 @@ def weights_type(precision: Precision) -> Any:
 
 
 def types_by_name(precision: Precision, more: Mapping[Any, str] | None = None) -> TypesByName:
-    """Return the Warp types of the names in sums and kernels. All other names have the type of a number. ``more`` takes
-    precedence."""
+    """Return Warp types by name. Names that are not listed have the type of a number. ``more`` takes precedence."""
     common = {
         neighbourhood_type(precision): "s",
         precision.vector: "x v u g f h gamma beside mirror normal whole crowd apart arm kick thrust delta foot turn "
