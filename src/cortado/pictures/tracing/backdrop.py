@@ -236,7 +236,7 @@ def open_background(s: Environment, shadow: Vec3s2d, o: wp.vec3, d: wp.vec3, spr
 
 @wp.func
 def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, span: wp.vec2):
-    """Cut the interval ``span`` of a ray at two planes. ``o`` and ``d`` are components along the normal of the planes."""
+    """Cut the interval ``span`` of a ray at two planes. ``o`` and ``d`` are components along the planes' normal."""
     if wp.abs(d) > 1.0e-9:
         t1 = (lower - o) / d
         t2 = (upper - o) / d
@@ -317,8 +317,6 @@ def wall_normal(s: Environment, p: wp.vec3):
 
 EDGE = (0.50, 0.62, 0.64)
 GLASS_EDGE = wp.constant(wp.vec3(*EDGE))
-
-
 MILKY = wp.constant(wp.float32(0.07))
 """Greatest reflectance of a pane of glass."""
 
