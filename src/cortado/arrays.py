@@ -47,6 +47,11 @@ def as_numbers(what: str, value: Any) -> np.ndarray:
     raise InputError(f"{what} is {shown(found)}, but must be a number or an array of real numbers{advice}.")
 
 
+def is_same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Test if two arrays of one data type have equal shapes and equal bits."""
+    return one.shape == other.shape and one.tobytes() == other.tobytes()
+
+
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
     """Convert real numbers to float64. Raises `InputError` for other types and for float16."""
     kind = str(getattr(value, "dtype", ""))

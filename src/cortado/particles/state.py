@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from cortado.arrays import is_same
 from cortado.calls import Staying
 from cortado.device.precision import Precision
 from cortado.device.reduction import TreeReduction, sum_of
@@ -307,7 +308,7 @@ class Parameters(Arrays):
                 self._written[name] = array
                 continue
             given = np.array(value, dtype=np.float64)
-            if isinstance(last, np.ndarray) and np.array_equal(last, given):
+            if isinstance(last, np.ndarray) and is_same(last, given):
                 continue
             self._written[name] = given
             is_vector = hasattr(array.dtype, "_shape_")

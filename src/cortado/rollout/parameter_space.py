@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import as_numbers, as_one_number, check_steps, require_names
+from cortado.arrays import as_numbers, as_one_number, check_steps, is_same, require_names
 from cortado.device.threads import WARP
 from cortado.errors import InputError, OutOfRangeError, shown, warn
 from cortado.particles.state import Parameters, State
@@ -72,17 +72,19 @@ class ParameterSpace:
         """Raise `InputError` or warn if a run with these values would fail. Unchanged values are not checked again."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()
-        changed = [name for name, value in values.items() if is_first or not np.array_equal(value, last[name])]
+        gravity = values.get("gravity")
+        strength = 0.0 if gravity is None else float(np.einsum("...i,...i", gravity, gravity).max())
+        weaker = {"gravity"} if strength <= strongest and not self._have_checks else set()
+        changed = [
+            name for name, value in values.items() if is_first or not (name in weaker or is_same(value, last[name]))
+        ]
         if not (changed or is_first):
             return
-        is_of_gravity = not is_first and changed == ["gravity"] and not self._have_checks
-        gravity = float(np.square(values["gravity"]).sum(axis=-1).max()) if "gravity" in values else 0.0
-        if not is_of_gravity or gravity > strongest:
-            check_sizes({name: values[name] for name in changed}, self._simulation.precision, self._known)
-            for number, own in enumerate(self._different(values)):
-                self._check(own, number)
+        check_sizes({name: values[name] for name in changed}, self._simulation.precision, self._known)
+        for number, own in enumerate(self._different(values)):
+            self._check(own, number)
         copies = {name: values[name].copy() if name in changed else last[name] for name in values}
-        self._judged = copies, max(gravity, strongest) if is_of_gravity else gravity
+        self._judged = copies, strength
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
         found = require_names(what, names)
@@ -189,7 +191,7 @@ class ParameterSpace:
         return (
             rollout.goes_on
             and last.keys() == values.keys()
-            and all(name == "gravity" or np.array_equal(value, last[name]) for name, value in values.items())
+            and all(name == "gravity" or is_same(value, last[name]) for name, value in values.items())
             and ("gravity" not in values or values["gravity"].shape == last["gravity"].shape)
             and others == _VARIED.intersection(varied)
             and [state.origin for state in states] == rollout.origins
@@ -201,7 +203,7 @@ class ParameterSpace:
         rollout.begin_evaluation()
         rollout.clocks = [state.clock for state in states]
         write(rollout.initial)
-        if "gravity" in members[0] and not np.isnan(members[0]["gravity"]).any():  # NaN stands in for a Warp array
+        if "gravity" in members[0] and not np.isnan(members[0]["gravity"].flat[0]):  # NaN stands in for a Warp array
             rows = np.empty((len(members), max(self._steps, 1), self._simulation.dimension))
             for own, member in zip(rows, members, strict=True):
                 own[:] = member["gravity"]

@@ -138,13 +138,14 @@ class Rollout(Staying):
 
     def begin_evaluation(self) -> None:
         """Prepare for a new first state and new parameters. Residuals in use first copy the current values."""
-        if len(self.pending) > 1:
-            self._checkpoints.release()  # several residuals share them, so they must not be reused
-        for pending in list(self.pending):
-            pending.put_aside()
         if self.pending:
+            pending = list(self.pending)
+            if len(pending) > 1:
+                self._checkpoints.release()  # several residuals share them, so they must not be reused
+            for residual in pending:
+                residual.put_aside()
             self._checkpoints = Checkpoints(self.initial, self._interval)
-        self.pending.clear()
+            self.pending.clear()
         self.progress, self.evaluation = Progress(), next(self._evaluations)
 
     @in_turn

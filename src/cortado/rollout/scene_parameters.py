@@ -63,13 +63,16 @@ class SceneParameters:
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps, self._known = simulation, steps, simulation.known
-        self._scheduled = simulation.scene.schedule.courses
+        self._scheduled, self._shapes = simulation.scene.schedule.courses, dict[str, list[tuple[int, ...]]]()
         absent = {name: np.zeros(self.shapes(name)[0]) for name in self._known.run}
         self.values: Arrays = absent | scene_values(simulation, self._known)
 
     def shapes(self, name: str) -> list[tuple[int, ...]]:
-        simulation = self._simulation
-        return self._known[name].shapes(self._steps, len(simulation.scene.phase), simulation.positions.shape)
+        if name not in self._shapes:
+            simulation = self._simulation
+            sizes = self._steps, len(simulation.scene.phase), simulation.positions.shape
+            self._shapes[name] = self._known[name].shapes(*sizes)
+        return self._shapes[name]
 
     def upright(self, values: Arrays) -> Arrays:
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values

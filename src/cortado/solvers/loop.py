@@ -143,14 +143,11 @@ class StepRecord:
         """Return the number of iterations of each step (steps,), in a batch the greatest over all scenes."""
         return self.copies[0].read(self._steps).max(axis=1)
 
-    def is_within(self, limits: Mapping[str, float]) -> bool:
-        """Test if no diagnostic of the last run exceeds its limit in ``limits``. A NaN fails the test."""
-        columns = {
-            name: self.copies[1].read(self._steps)[..., k] for k, name in enumerate(self._columns) if name in limits
-        }
-        if self._name in limits:
-            columns[self._name] = self.copies[0].read(self._steps)
-        return all(bool((column <= limits[name]).all()) for name, column in columns.items())
+    def bounds(self, limits: Mapping[str, float]) -> list[NDArray]:
+        """Return an upper bound for each array in ``copies``. Diagnostics that are not named in ``limits`` are
+        unbounded."""
+        columns = [limits.get(name, np.inf) for name in self._columns] + [np.inf] * (2 - len(self._columns))
+        return [np.array(limits.get(self._name, np.inf)), np.array(columns)][: len(self.copies)]
 
     def assign(self, other: Self) -> None:
         for own, given, copy in zip(self.arrays, other.arrays, self.copies, strict=True):
@@ -167,6 +164,7 @@ class IterationLog:
         self.solves = [(solve, StepRecord(steps, layout, solve.name)) for solve in solves]
         self._records, self._steps, self._layout = [one for _, one in (*self.loops, *self.solves)], 0, layout
         self.copies = [copy for record in self._records for copy in record.copies]
+        self._bounds: tuple[Mapping[str, float], list[tuple[HostCopy, NDArray]]] = {}, []
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
@@ -180,10 +178,14 @@ class IterationLog:
         return {**found, "converged": converged}
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
-        own = dict(limits)
-        for loop, _ in self.loops:
-            own |= {name: min(bound, own.get(name, np.inf)) for name, bound in loop.bounds.items() if bound < np.inf}
-        return all(record.is_within(own) for record in self._records)
+        if self._bounds[0] != limits:
+            own = dict(limits)
+            for loop, _ in self.loops:
+                own |= {name: min(bound, own.get(name, np.inf)) for name, bound in loop.bounds.items()}
+            bounds = [bound for record in self._records for bound in record.bounds(own)]
+            each = zip(self.copies, bounds, strict=True)
+            self._bounds = limits, [(copy, bound) for copy, bound in each if bound.min() < np.inf]
+        return all((copy.read(self._steps) <= bound).all() for copy, bound in self._bounds[1])
 
     def read(self, steps: int) -> None:
         self._steps = steps

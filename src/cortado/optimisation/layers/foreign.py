@@ -125,16 +125,15 @@ def _array_at(address: int, size: int, dtype: str, device: Any) -> Any:
 
 
 def _call(frame: Any, device: Any) -> None:
-    scalar = ctypes.cast(frame.attrs.attrs[0], ctypes.POINTER(xla_ffi.XLA_FFI_Scalar)).contents
-    function, given, made = _CALLS[ctypes.cast(scalar.value, ctypes.POINTER(ctypes.c_int64)).contents.value]
+    number = xla_ffi.XLA_FFI_Scalar.from_address(frame.attrs.attrs[0]).value
+    function, given, made = _CALLS[ctypes.c_int64.from_address(number).value]
     _, arrays = given.at(_addresses(frame.args.args, frame.args.size), device)
     whole, views = made.at(_addresses(frame.rets.rets, frame.rets.size), device)
     made.fill(whole, views, function(arrays))
 
 
 def _addresses(buffers: Any, size: int) -> tuple[int, ...]:
-    pointers = ctypes.cast(buffers, ctypes.POINTER(ctypes.POINTER(xla_ffi.XLA_FFI_Buffer)))
-    return tuple(pointers[k].contents.data for k in range(size))
+    return tuple(xla_ffi.XLA_FFI_Buffer.from_address(buffers[k]).data for k in range(size))
 
 
 def _call_on_cpu(frame: Any) -> None:

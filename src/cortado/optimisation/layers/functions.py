@@ -71,10 +71,11 @@ class LayerParameters:
         return {name: self._shaped(name, on_host(array).astype(np.float64)) for name, array in own.items()}
 
     def on_device(self, given: Named) -> dict[str, Array]:
-        own = part(given, PARAMETER)
-        stays = {name for name, array in own.items() if isinstance(array, wp.array) and self._rows.takes(name)}
-        each = {name: array if name in stays else on_host(array).astype(np.float64) for name, array in own.items()}
-        return {name: self._shaped(name, array) for name, array in each.items()}
+        found = {}
+        for name, array in part(given, PARAMETER).items():
+            stays = isinstance(array, wp.array) and self._rows.takes(name)
+            found[name] = self._shaped(name, array if stays else on_host(array).astype(np.float64))
+        return found
 
     def _shaped(self, name: str, array: Array) -> Array:
         shapes = self._space.shapes(name)

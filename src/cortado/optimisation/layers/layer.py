@@ -277,10 +277,11 @@ class NamedStates(HostStates):
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
         views, packed = state.narrow(self._simulation.dimension), self._packed(state)
-        if packed is not None:
+        if packed is None:
+            found = {name: array.copy() for name, array in views.items()}
+        else:
             packed.read()
-        kept = {} if packed is None else packed.views
-        found = {name: kept[name] if name in kept else np.array(on_host(array)) for name, array in views.items()}
+            found = {name: packed.views[name] if name in packed.views else a.numpy() for name, a in views.items()}
         for b, number in lost.items():
             for array in found.values():
                 member = array[b]
@@ -305,7 +306,7 @@ class NamedStates(HostStates):
                 continue
             array = given[name]
             if isinstance(own, np.ndarray):
-                own[...] = on_host(array).reshape(own.shape)
+                own[...] = array
             elif isinstance(array, wp.array) and array.dtype == own.dtype and array.device == own.device:
                 wp.copy(own, array.reshape(own.shape))
             else:
@@ -316,9 +317,9 @@ class NamedStates(HostStates):
     ) -> dict[str, Array]:
         """Add the clocks of all scenes to the fields of a state. On a CPU, remember a ``judged`` state as valid."""
         members, found = self.shapes[STATE_TIME], dict(fields)
-        found[STATE_TIME] = np.reshape([scene.clock.time for scene in scenes], members)
+        found[STATE_TIME] = np.array([scene.clock.time for scene in scenes]).reshape(members)
         if LAST_STEP in self.shapes:
-            found[LAST_STEP] = np.reshape([scene.clock.time_step for scene in scenes], members)
+            found[LAST_STEP] = np.array([scene.clock.time_step for scene in scenes]).reshape(members)
         if self._is_cpu and judged:
             self._remember_last()
             self._last = self._bytes(found), tuple(scenes)
@@ -339,7 +340,7 @@ class NamedStates(HostStates):
 
     def _bytes(self, given: Named) -> dict[str, bytes]:
         real = self._simulation.precision.numpy
-        return {name: np.asarray(on_host(given[name]), dtype=real).tobytes() for name in self.shapes}
+        return {name: np.asarray(given[name], dtype=real).tobytes() for name in self.shapes}
 
     def _judged(self, given: Named, values: Arrays) -> tuple[RestartState, ...]:
         """Check a state, and return restart states of all scenes without fields."""
