@@ -64,8 +64,7 @@ FINISHES = {
 
 
 class Coloured(Table):
-    """Base of tables with a colour. The default colour is the colour of the table's material, or ``plain`` without a
-    material."""
+    """Base of tables with a colour. The default is the colour of the material, or ``plain`` without a material."""
 
     materials: ClassVar[Mapping[str, Any]]
     plain: ClassVar[Numbers]
@@ -128,8 +127,6 @@ class View:
 
 @dataclass(frozen=True)
 class Moment:
-    """One moment of a film: its time in the run, and the positions of the solids."""
-
     share: float
     """Elapsed fraction of the film, from 0 to 1."""
     time: float
@@ -141,8 +138,6 @@ class Moment:
 
 
 class CameraPath(Table):
-    """Base of the paths of a moving camera."""
-
     goes_around: ClassVar[bool] = False
     """True if the camera sees the scene from all sides along its path."""
     kind: str
@@ -152,9 +147,7 @@ class CameraPath(Table):
         """Return the view of the camera at a moment of the film. ``home`` is the view of a camera at rest."""
         raise NotImplementedError
 
-    def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None:
-        """Raise a `field_error` at ``path`` if the camera path refers to an unknown solid. ``names`` are the names of
-        the scene's solids."""
+    def check_solids(self, names: Sequence[str], path: FieldPath = ()) -> None: ...
 
 
 @public
@@ -163,7 +156,6 @@ class Orbit(CameraPath):
 
     goes_around: ClassVar[bool] = True
     kind: Literal["orbit"] = "orbit"
-    """Name of the kind of path."""
     turns: Annotated[float, quantity(ge=-100.0, le=100.0)] = 1.0
     """Number of turns during the film. Seen from above, positive turns are counterclockwise."""
 
@@ -179,7 +171,6 @@ class Dolly(CameraPath):
     """A straight camera path towards the middle of the picture, or away from it. The camera starts and stops gently."""
 
     kind: Literal["dolly"] = "dolly"
-    """Name of the kind of path."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
     """Final distance of the camera from the middle of the picture, as a multiple of the initial distance."""
 
@@ -193,7 +184,6 @@ class Keyframes(CameraPath):
     """A smooth camera path through given positions at given times of the run."""
 
     kind: Literal["keyframes"] = "keyframes"
-    """Name of the kind of path."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...]
     """(k,) Times of the run, increasing [s]. The camera rests before the first and after the last time."""
     cameras: tuple[tuple[Length, ...], ...]
@@ -227,7 +217,6 @@ class Follow(CameraPath):
     """A camera path that moves with a solid and looks at its centre from a fixed direction and distance."""
 
     kind: Literal["follow"] = "follow"
-    """Name of the kind of path."""
     solid: Text
     """Name of the solid that the camera follows."""
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 1.0

@@ -29,7 +29,6 @@ FINE, MOST = 0.5, 40
 
 
 def check_free_bodies(scene: SceneTables) -> None:
-    """Check that free bodies do not overlap walls or solids at the start, and that the solver supports free bodies."""
     bodies = free(scene.solid)
     if not bodies:
         return
@@ -105,8 +104,7 @@ def check_distinct(path: FieldPath, fluid: Fluid, spacing: float) -> None:
 
 
 def check_overlaps(placed: list[tuple[FieldPath, FluidBody]], lengths: Points, spacing: float) -> None:
-    """Check that bodies of fluid do not overlap, with their periodic images included. ``lengths`` (d,) [m] are the
-    lengths of the periodic box."""
+    """``lengths`` (d,) [m] are the lengths of the periodic box, and 0 along other axes."""
     paths, bodies = zip(*placed, strict=True)
     lower, upper = np.swapaxes([body.extent(spacing) for body in bodies], 0, 1)
     shifts = [np.array(s) * lengths for s in product(*[(0, -1, 1) if length else (0,) for length in lengths])]
@@ -307,7 +305,6 @@ def _check_outside_solids(scene: SceneTables, path: FieldPath, points: Points) -
 
 
 def _check_outlet(scene: SceneTables, path: FieldPath, emitter: EmitterTable) -> None:
-    """Check that the opening of an emitter stays inside the container, and that its fluid flows into the container."""
     spacing, lengths = scene.discretisation.spacing, scene.periods[1]
     tolerance, outlet, opening = 1e-6 * spacing, np.array(emitter.outlet), emitter.opening(spacing)
     if not scene.container.contains(outlet[None], tolerance).all():

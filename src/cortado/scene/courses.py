@@ -25,14 +25,13 @@ class Steady:
     """Rate of change per second, a number or an array (components,)."""
 
     def at(self, times: NDArray) -> NDArray:
-        """Return the values (n,) or (n, components) of the quantity at ``times`` (n,) [s]."""
+        """Return the values (n,) or (n, components) at ``times`` (n,) [s]. The value at time 0 is 0."""
         return np.multiply.outer(times, self.rate)
 
     def greatest(self) -> float:
         return float(np.linalg.norm(self.rate))
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return the time derivatives (n,) or (n, components) of the quantity at ``times`` (n,) [s]."""
         return np.broadcast_to(self.rate, (*np.shape(times), *self.rate.shape))
 
 
@@ -59,8 +58,7 @@ class Knots:
         return found if not self.ramp else self.begun + self._weights(times)[0] * (found - self.begun)
 
     def rates(self, times: NDArray) -> NDArray:
-        """Return the time derivatives of the curve, (n,) or (n, components), at ``times`` (n,) [s]. At a kink, return
-        the derivative just after the kink."""
+        """Return the time derivatives at ``times`` (n,) [s]. At a kink, return the derivative just after the kink."""
         if self.interpolation == "spline" and len(self.times) > 1:
             found = np.asarray(self._spline(times, 1)).T
             found = np.where((times >= self.times[0]) & (times < self.times[-1]), found, 0.0).T
@@ -78,7 +76,7 @@ class Knots:
 
     @cached_property
     def breaks(self) -> NDArray[np.float64]:
-        """Times (m,) [s] at which the curve may have kinks. Between these times the curve is smooth."""
+        """Times (m,) [s] at which the curve may have kinks."""
         along = np.linspace(0.0, self.ramp, RAMP_PARTS + 1) if self.ramp else self.times[:1]
         return np.unique(np.concatenate([self.times, along]))
 
@@ -108,9 +106,8 @@ class Knots:
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
-    """Return the greatest speed within each interval between the ``times`` (k,) [s]. ``moved`` are pairs of a factor
-    and a curve. The speed is the sum over all curves of the factor times the magnitude of the curve's time derivative.
-    """
+    """Return the greatest speed in each interval between ``times`` (k,) [s]. ``moved`` are pairs of a factor and a
+    curve. The speed is the sum over the curves of factor times magnitude of the time derivative."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     return np.append(sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1), 0.0)
@@ -140,14 +137,10 @@ Columns = tuple[tuple[str, str], ...]
 
 @cached_by_file(8, MOST_BYTES)
 def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArray, dict[str, NDArray]]:
-    """Return the times (k,) [s] in a CSV file, and its other columns (k,) by name. Values are converted to the units of
-    a scene.
-
-    Raises `InputError` with the file, the column, the invalid value and the allowed values.
+    """Return the times (k,) [s] in a CSV file, and its other columns (k,) by name, in units of a scene.
 
     Args:
-        file: path of the file. Its header has names with units, such as ``time [s],x [mm],rotation [deg]``. The lines
-            below the header have numbers, with increasing times.
+        file: path of the file. Its header has names with units, such as ``time [s],x [mm],rotation [deg]``.
         columns: allowed columns besides the time.
         needs_all: True if the file must have all of ``columns``, False if one column is enough.
     """
@@ -183,8 +176,7 @@ def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArra
 
 
 def lists_in_file(table: Any, path: FieldPath, columns: Columns, what: str, needs_all: bool) -> dict[str, Any]:
-    """Return the lists in a table's CSV file, by the keys of the table, such as ``times`` and ``torques``. Raise a
-    `field_error` for an invalid file."""
+    """Return the lists in a table's CSV file, by keys of the table such as ``times`` and ``torques``."""
     names = [name for name, _ in columns]
     for key in (*names, "times", *(f"{name}s" for name in names)):
         if (found := getattr(table, key)) is not None:
@@ -202,8 +194,7 @@ Rows = NDArray[np.float64]
 
 
 def path_of(solid: Any, dimension: int) -> tuple[Rows, Rows | None, Rows | None] | None:
-    """Return the prescribed path of a solid: times (k,) [s], displacements (k, d) [m], and rotations (k, 1) or (k, 3)
-    [rad]. Return None for a solid without a path. Raises `InputError` for an invalid file."""
+    """Return a solid's path: times (k,) [s], displacements (k, d) [m], and rotations (k, 1) or (k, 3) [rad]."""
     if solid.path is None:
         if solid.times is None:
             return None
@@ -324,8 +315,8 @@ def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
 
 
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check that the key ``times`` of a table increases from 0, and that there is a value for each time. ``values`` is
-    the name of the key with the values. The table must not also have the key named by ``constant``."""
+    """Check that ``times`` increase from 0, that the key ``values`` has a value for each time, and that the key
+    ``constant`` is left out."""
     _check_times(path, table.times)
     given, wanted = getattr(table, values), f"a list of {len(table.times)}, as are times"
     if given is None or len(given) != len(table.times):

@@ -47,7 +47,6 @@ class Walls(Rows):
     feet: Points
     """Vectors from the wall particles to the nearest points on the wall's surface (b, d) [m]."""
     sticks: NDArray[np.bool_]
-    """True for particles of no-slip walls (b,)."""
     slides: Points
     """Velocity of a surface that slides like a conveyor belt (b, d) [m/s], relative to its solid."""
     solid: NDArray[np.int64]
@@ -145,7 +144,6 @@ def _alone(table: SolidTable, number: int, periods: Points, lattice: RestLattice
 def _beside_sheets(
     scene: Scene, tables: Sequence[SolidTable], room: Room, others: Sequence[Walls], lattice: RestLattice
 ) -> list[Walls]:
-    """Build the wall particles on both sides of sheets."""
     if not tables:
         return []
     sheets, found, numbers = list[Sheet](), list[Walls](), wall_numbers(scene.solid)
@@ -165,7 +163,6 @@ def _beside_sheets(
 
 
 def _weighed(surface: ExposedSurface, beside: Places, kept: Walls, lattice: RestLattice) -> tuple[WallPoints, Points]:
-    """Return the wall particles below a surface and their weights."""
     room, spacing, reach = surface.container.room, lattice.spacing, lattice.support
     points = surface.walls(lattice)
     about = Places.joined([beside, *(solid_places(solid, spacing, reach) for solid in room.solids)])
@@ -176,8 +173,7 @@ def _weighed(surface: ExposedSurface, beside: Places, kept: Walls, lattice: Rest
 
 
 def mirrors_of(scene: Scene) -> tuple[Points, Points]:
-    """Return the positions of the flat walls that mirror the fluid: lower walls (3,) [m] and upper walls (3,) [m]. The
-    position is infinite if an axis has no such wall."""
+    """Return the positions (3,) [m] of lower and upper walls that mirror the fluid; infinite without such a wall."""
     nowhere = np.full(3, np.inf)
     if not isinstance(scene.solver, ProjectionSolver):
         return -nowhere, nowhere
@@ -269,7 +265,7 @@ def discretise(scene: Scene) -> DiscreteScene:
 
 
 def _settled(scene: Scene, fluid: FluidSample, walls: Walls, lattice: RestLattice) -> FluidSample:
-    """Return the fluid after packing. Each particle is at least `OFF_SHEETS` spacings from sheets."""
+    """Pack the fluid, and keep each particle at least `OFF_SHEETS` spacings from sheets."""
     if fluid.bodies:
         stays, (lower, lengths) = ~fluid.is_packed, scene.periods
         air, shares = air_around(fluid.bodies, fluid.positions[stays], lower, lengths, lattice.support)
@@ -287,7 +283,6 @@ def _settled(scene: Scene, fluid: FluidSample, walls: Walls, lattice: RestLattic
 
 
 def check_distance(scene: Scene, discrete: DiscreteScene, precision: "Precision") -> None:
-    """Raise `InputError` if a scene is so far from the origin that ``precision`` cannot resolve its positions."""
     spacing = scene.discretisation.spacing
     furthest = max(np.abs(discrete.near.lower).max(), np.abs(discrete.near.upper).max()) / spacing
     if furthest > precision.furthest:

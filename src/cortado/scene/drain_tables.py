@@ -36,14 +36,12 @@ class BoxDrain(Ordered):
         return super().in_dimension(dimension, path)
 
     def ends(self, dimension: int) -> Points:
-        """Return the lower and the upper corner of the box (2, d) [m]. A coordinate is infinite where the box has no
-        limit."""
+        """Return the lower and the upper corner (2, d) [m]. Coordinates without a limit are infinite."""
         none = np.full(dimension, np.inf)
         return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
 
     def middle(self, dimension: int) -> Points:
-        """Return the middle of the box (d,) [m]. Along an axis with only one limit, return the coordinate of this
-        limit."""
+        """Return the middle (d,) [m]. Along an axis with only one limit, return the coordinate of this limit."""
         ends = self.ends(dimension)
         return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
 
@@ -65,7 +63,6 @@ class PlaneDrain(Table):
 
 
 flow_name = ending("flow_rate")
-"""Name of a parameter: flow rate of an emitter or a sink."""
 count_name = ending("count")
 """Name of a state field: number of particles that a drain has removed."""
 
@@ -100,7 +97,6 @@ class FlowTable(Table):
 
     @property
     def course(self) -> Knots | None:
-        """Return the curve of the flow rate over time, or None for a constant flow rate."""
         return None if self.times is None else Knots(np.array(self.times), np.array(self.flow_rates))
 
     @property
@@ -118,13 +114,12 @@ class FlowTable(Table):
         return max(self._flows)
 
     def passed(self, time: float) -> float:
-        """Return the volume [m3], in 2-D the area [m2], of the fluid that flows from the start until ``time`` [s]."""
+        """Return the volume [m3], in 2-D the area [m2], that flows from the start until ``time`` [s]."""
         times = np.append(np.clip(self.times or 0.0, 0.0, time), time)
         return float(np.trapezoid(np.interp(times, self.times or (0.0,), self._flows), times))
 
     def time_for(self, volume: float) -> float:
-        """Return the time [s] at which the given ``volume`` of fluid, in 2-D an area, has flowed. The time is infinite
-        if less fluid flows in total."""
+        """Return the time [s] at which ``volume`` [m3], in 2-D [m2], has flowed; infinite if it never has."""
         last = float((self.times or (0.0,))[-1])
         times = np.union1d(self.times or 0.0, np.linspace(0.0, last, 1025))
         flows = np.interp(times, self.times or (0.0,), self._flows)
@@ -212,8 +207,7 @@ def _check_reached(scene: Any, drain: BoxDrain | PlaneDrain, ends: Points, path:
 
 
 def sink_limit(scene: Any, values: Any) -> float:
-    """Return the longest time step [s] for a scene with sinks. In a time step, fluid near a sink moves at most 0.4
-    spacings."""
+    """Return the longest time step [s] in which fluid near a sink moves at most 0.4 spacings."""
     longest, spacing = inf, scene.discretisation.spacing
     for drain in scene.drain:
         if isinstance(drain, SinkDrain):
@@ -241,8 +235,8 @@ PARTS = 16
 
 
 def open_sphere(room: Room, place: Points, radius: float) -> float:
-    """Return the solid angle [sr] of the directions from ``place`` (d,) [m] without walls within ``radius`` [m]. In
-    2-D, return the angle [rad] of these directions."""
+    """Return the solid angle [sr], in 2-D the angle [rad], of the directions from ``place`` (d,) [m] without walls
+    within ``radius`` [m]."""
     k = np.arange(DIRECTIONS) + 0.5
     if len(place) == 2:
         turn = 2.0 * np.pi * k / DIRECTIONS

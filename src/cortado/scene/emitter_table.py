@@ -21,7 +21,7 @@ from cortado.scene.tables import MISSING, Direction, FieldPath, Length, Text, Ve
 
 @dataclass(frozen=True)
 class EmitterSample:
-    """Particles of an emitter, sorted by layer. The first layer is at the opening, and m is the number of particles."""
+    """The m particles of an emitter, sorted by layer. The first layer is at the opening."""
 
     offsets: Points
     """Vectors (m, d) [m] from the axis of the emitter to the particles, perpendicular to the axis."""
@@ -50,8 +50,6 @@ class EmitterSample:
         return np.where(np.ravel(again) > 0.0, joined, found)
 
     def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
-        """Return a mask of the particles that have not left the emitter yet (particles,). ``others`` are fields of a
-        state."""
         emitted = float(np.ravel(others[emitted_name(name)])[0])
         return self.in_line(name, first, others, particles) > emitted
 
@@ -60,14 +58,12 @@ OF_OPENINGS = ("emitted", "again", "drained", ".count")
 COLUMN = 6.0
 """Default length of the column of fluid behind the opening [spacings]."""
 path_name = ending("path")
-"""Name of a parameter: position of an emitter's opening over time [m]."""
 outlet_name = ending("outlet")
 """Name of a state field: position of an emitter's opening [m]."""
 emitted_name = ending("emitted")
 """Name of a state field: length of the fluid column that has left an emitter [m]."""
 again_name = ending("again")
-"""Name of a state field: position of each particle in the queue to be emitted again, counted from 1. The position is 0
-for particles outside the queue."""
+"""Name of a state field: place of each particle in the queue to be emitted again, from 1; 0 outside the queue."""
 
 
 def _path_of(name: str, of: str, outlet: Any, course: Knots | None = None) -> Parameter:
@@ -129,7 +125,6 @@ class EmitterTable(FluidBody, FlowTable):
         return placed.model_copy(update={"path": self.path.in_dimension(dimension, (*path, "path"))})
 
     def layers(self, spacing: float) -> float:
-        """Return the number of layers of particles in the waiting column."""
         length = COLUMN * spacing if self.length is None else self.length
         within = float(max(math.ceil(length / spacing - 0.5 - ROUND_OFF), 0))
         return within if self.volume is None or self.fed_by else min(within, self.supply(spacing))
@@ -141,13 +136,11 @@ class EmitterTable(FluidBody, FlowTable):
         return float(max(math.ceil(given - ROUND_OFF), 1))
 
     def dry_after(self, spacing: float) -> float:
-        """Return the time [s] at which the emitter runs out of fluid. The time is infinite if the emitter never runs
-        out."""
+        """Return the time [s] at which the emitter runs out of fluid; infinite if it never does."""
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return the table with enough fluid until ``time`` [s]. A table with the key ``volume`` is returned
-        unchanged."""
+        """Return the table with enough fluid until ``time`` [s]. A given ``volume`` stays unchanged."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)
@@ -158,11 +151,11 @@ class EmitterTable(FluidBody, FlowTable):
         return self.greatest / self.area(spacing)
 
     def area(self, spacing: float) -> float:
-        """Return the total area of the lattice cells inside the opening [m2], in 2-D their total width [m]."""
+        """Return the total area [m2], in 2-D the width [m], of the lattice cells inside the opening."""
         return float(len(self._cross_section(spacing)) * spacing ** (len(self.outlet) - 1))
 
     def asked_area(self) -> float:
-        """Area of the opening that the scene file prescribes [m2], in 2-D its width [m]."""
+        """Area [m2], in 2-D width [m], of the opening that the scene file prescribes."""
         if self.radius is None:
             return math.prod(self.sides or ())
         return 2.0 * self.radius if len(self.outlet) == 2 else float(np.pi * self.radius**2)
@@ -233,7 +226,6 @@ def check_fed(scene: Any) -> None:
 
 
 def check_columns(scene: Any) -> None:
-    """Check that no sheet crosses the waiting column of an emitter at the start, or is too close to its opening."""
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         opening, ahead = emitter.opening(spacing), spacing * np.array(emitter.direction)
@@ -247,16 +239,14 @@ def check_columns(scene: Any) -> None:
 
 
 def samples(scene: Any, count: int) -> list[tuple[str, int, EmitterSample]]:
-    """Return three values for each emitter: its name, the index of its first particle, and its particles. ``count`` is
-    the number of fluid particles in the scene."""
+    """Return the name, the index of the first particle and the particles of each emitter."""
     made = [emitter.sample(scene.discretisation.spacing) for emitter in scene.emitter]
     ends = count - np.cumsum([0, *(len(sample.upstream) for sample in made[::-1])])[::-1]
     return list(zip([emitter.name for emitter in scene.emitter], ends[:-1].tolist(), made, strict=True))
 
 
 def waits(scene: Any, others: Any, particles: int) -> NDArray[np.bool_]:
-    """Return a mask of the particles that have not left their emitter yet (particles,). ``others`` are fields of a
-    state."""
+    """Return a mask of the particles that have not left their emitter yet (particles,)."""
     found = np.zeros(particles, dtype=bool)
     for name, first, sample in samples(scene, particles):
         if emitted_name(name) in others:

@@ -1,8 +1,4 @@
-"""Initial fluid particles of a scene, in float64.
-
-For a body of fluid with a curved or oblique surface, the number of particles fits the volume of the body. The particles
-are then packed (`cortado.discretise.packing`).
-"""
+"""Initial fluid particles of a scene, in float64."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -42,8 +38,7 @@ class CutBody:
         return np.maximum(self.fluid.distance(points, self.spacing, reach), self.room.distance(points, reach))
 
     def shares(self, points: Points) -> Points:
-        """Return the fraction of each lattice cell inside the body (n,). ``points`` (n, d) [m] are the centres of the
-        cells."""
+        """Return the fraction (n,) of lattice cells inside the body. ``points`` (n, d) [m] are the centres of cells."""
         return np.clip(0.5 - self.distance(points, 0.5 * self.spacing) / self.spacing, 0.0, 1.0)
 
     def volume(self, depth: float = 0.0, beside_cuts: bool = False) -> float:
@@ -77,7 +72,6 @@ class CutBody:
         return round((volume - lacking) / self.spacing**self.room.dimension)
 
     def particles(self) -> Points:
-        """Return initial positions on the lattice (n, d) [m]."""
         if not self.fluid.cuts_cells(self.spacing):
             from_solids = self.room.from_solids(self.fluid.particles(self.spacing), self.spacing)
             if (np.abs(from_solids) >= (0.5 - ALIGNED) * self.fluid.block(self.spacing).spacings.min()).all():
@@ -103,8 +97,8 @@ class CutBody:
 def air_around(
     bodies: tuple[CutBody, ...], staying: Points, lower: Points, lengths: Points, reach: float
 ) -> tuple[Points, Points]:
-    """Return lattice points (m, d) [m] in the air around bodies of fluid, within ``reach`` [m] of their surfaces. Also
-    return the fraction of air in the lattice cell around each point (m,).
+    """Return lattice points (m, d) [m] in the air within ``reach`` [m] of the surfaces of bodies of fluid. Also return
+    the fraction of air in the lattice cell around each point (m,).
 
     ``staying`` (k, d) [m] are the particles that packing does not move. ``lower`` and ``lengths`` (d,) [m] are the
     lower corner and the lengths of the periodic box. The length is 0 along an axis that is not periodic.
@@ -135,18 +129,14 @@ def air_around(
 @dataclass(frozen=True)
 class FluidSample:
     positions: Points
-    """Positions (n, d) [m]."""
     velocities: Points
-    """Velocities (n, d) [m/s]."""
     phase: NDArray[np.int64]
-    """Index of the phase of each particle (n,)."""
     sizes: tuple[int, ...]
     """Number of particles of each body of fluid, without emitters."""
     asked: tuple[float, ...]
     """Prescribed volume of each body, without its parts inside walls [m^d]."""
     bodies: tuple[CutBody, ...]
     is_packed: NDArray[np.bool_]
-    """True for packed particles (n,)."""
     is_placed: NDArray[np.bool_]
     """True for particles from a file of positions or from an emitter (n,)."""
     emitters: tuple[tuple[str, int, EmitterSample], ...]
@@ -155,8 +145,7 @@ class FluidSample:
     """Positions (n, d) [m] where particles rest while they are outside the simulation."""
 
     def some(self, kept: NDArray[np.int64]) -> "FluidSample":
-        """Return a sample with only the particles at the sorted indices ``kept`` (m,). All particles of emitters must
-        be in ``kept``."""
+        """Return only the particles at the sorted indices ``kept`` (m,), which contain all particles of emitters."""
         names = "positions", "velocities", "phase", "is_packed", "is_placed", "places"
         arrays = {name: getattr(self, name)[kept] for name in names}
         ends = np.searchsorted(kept, np.cumsum(self.sizes))
@@ -166,7 +155,7 @@ class FluidSample:
 
     @property
     def names(self) -> NDArray[np.str_]:
-        """Return, for each particle (n,), the name of its body of fluid, such as "fluid[1]"."""
+        """Return the name of the body of each particle (n,), such as "fluid[1]"."""
         named = *(f"fluid[{k}]" for k in range(len(self.sizes))), *(f"emitter {name}" for name, _, _ in self.emitters)
         ends = *np.cumsum(self.sizes), *(first for _, first, _ in self.emitters[1:]), len(self.positions)
         return np.repeat(named, np.diff(ends[: len(named)], prepend=0))
@@ -178,8 +167,7 @@ class FluidSample:
 
 
 def fluid_particles(scene: Scene) -> FluidSample:
-    """Build the fluid particles of a scene before packing. Raises `InputError` if a file of particle positions no
-    longer exists, or if walls leave no space for a body of fluid."""
+    """Build the fluid particles of a scene before packing."""
     spacing, names = scene.discretisation.spacing, [phase.name for phase in scene.phase]
     room, reach = scene.room, scene.discretisation.support_radius
     bodies, positions, velocities, asked = list[CutBody | None](), list[Points](), list[Points](), list[float]()
@@ -225,8 +213,7 @@ def fluid_particles(scene: Scene) -> FluidSample:
 
 
 def resting_places(scene: Scene, count: int) -> Points:
-    """Return positions (count, d) [m] for particles outside the simulation. Particles outside the simulation are
-    reserves of emitters, and particles that drains have removed.
+    """Return positions (count, d) [m] for reserves of emitters and for particles that drains have removed.
 
     The positions are far from the scene and from each other. If all axes are periodic, the positions are NaN.
     """
@@ -267,8 +254,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return messages about wrong masses, by phase name. A mass is wrong if it differs from the prescribed mass by
-        more than the fraction `EXCESS`."""
+        """Return messages about masses that differ by more than the fraction `EXCESS`, by phase name."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()

@@ -34,8 +34,7 @@ class FluidBody(Table):
         """Return the lower and the upper corner (d,) [m] of a box around all particles."""
 
     @abstractmethod
-    def particles(self, spacing: float) -> Points:
-        """Return the positions of the particles (n, d) [m]."""
+    def particles(self, spacing: float) -> Points: ...
 
 
 class Fluid(FluidBody):
@@ -48,7 +47,6 @@ class Fluid(FluidBody):
     one number, positive counterclockwise."""
 
     def velocities(self, points: Points) -> Points:
-        """Return initial velocities (n, d) [m/s] of particles at positions (n, d) [m]."""
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
         if self.angular_velocity is None:
             return found
@@ -63,24 +61,19 @@ class Fluid(FluidBody):
         return float(np.linalg.norm(self.velocity) + 0.5 * spin * np.linalg.norm(upper - lower))
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the positions (n, d) [m] of the particles inside the region ``room``."""
         return self.particles(spacing)
 
     @abstractmethod
-    def volume(self, spacing: float) -> float:
-        """Return the volume of the body [m^d]."""
+    def volume(self, spacing: float) -> float: ...
 
 
 class RegionFluid(Fluid):
-    """Base of bodies of fluid that fill a shape."""
-
     @abstractmethod
     def block(self, spacing: float) -> Block: ...
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape of the body, moved to have its centroid at the origin and without its rotation. Also return
-        the position of the centroid (d,) [m]."""
+        """Return the unrotated shape with its centroid at the origin, and the position of the centroid (d,) [m]."""
 
     def volume(self, spacing: float) -> float:
         return self.shape_about()[0].moments().volume
@@ -95,8 +88,7 @@ class RegionFluid(Fluid):
         return self.block(spacing).points()
 
     def particles_in(self, room: Room, spacing: float) -> Points:
-        """Return the positions (n, d) [m] of the particles inside the region ``room``. All particles are at least half
-        a spacing from walls."""
+        """Return the particles (n, d) [m] that are at least half a spacing from the walls of ``room``."""
         everything = self.particles(spacing)
         return everything[room.contains(everything, (ROUND_OFF - 0.5) * self.block(spacing).spacings.min())]
 
@@ -106,12 +98,10 @@ class RegionFluid(Fluid):
         ``reach`` [m] are only lower bounds."""
 
     def cuts_cells(self, spacing: float) -> bool:
-        """Test whether the surface of the body cuts cells of the lattice."""
         return False
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return the lattice points (n, d) [m] in a box around the shape. The box extends ``reach`` [m] beyond the
-        shape."""
+        """Return the lattice points (n, d) [m] in a box that extends ``reach`` [m] beyond the shape."""
         return self.block(spacing).grown(int(np.ceil(reach / spacing))).points()
 
 
@@ -184,7 +174,6 @@ class CylinderFluid(CylinderShape, Turnable, RoundFluid):
         return Region.cylinder(np.array(self.base), self.radius, self.height, self.along).distance(points)
 
     def lattice(self, spacing: float, reach: float) -> Points:
-        """Return the lattice points (n, d) [m] of a cylinder, with layers that fill its height."""
         layers = max(round(self.height / spacing), 1)
         along = self.height / layers
         across = np.sqrt(spacing**3 / along)
@@ -204,7 +193,6 @@ class PointsFluid(Fluid):
     starts at the scene file's folder."""
 
     def points(self) -> Points:
-        """Read the positions (n, d) [m] from the file. Raise `InputError` for an invalid file."""
         return read_points(self.file, len(self.velocity))
 
     def count(self, spacing: float) -> float:
@@ -257,19 +245,15 @@ class FilledShape(Filled):
 
 
 class TurnedBox(Filled, BoxFluid):
-    """A rotated box of fluid."""
-
     shape_about = BoxShape.shape_about
 
 
 class TurnedCylinder(Filled, CylinderFluid):
-    """A rotated cylinder of fluid."""
-
     shape_about = CylinderShape.shape_about
 
 
 def turned(fluid: Fluid) -> Fluid:
-    """Return a rotated box or cylinder of fluid as a body that is packed. Return any other body of fluid unchanged."""
+    """Return a rotated box or cylinder as a body that is packed, and any other body unchanged."""
     kinds: dict[type[Fluid], type[Filled]] = {BoxFluid: TurnedBox, CylinderFluid: TurnedCylinder}
     kind = kinds.get(type(fluid))
     if kind is None or not isinstance(fluid, Turnable) or fluid.rotation is None:

@@ -63,7 +63,7 @@ class HingeTable(Table):
 
     @property
     def turned_by(self) -> str | None:
-        """Return the first key in the table that belongs to a spring, damper or motor, or None."""
+        """Return the first given key of a spring, damper or motor, or None."""
         keys = ("stiffness", "damping", "torque", "speed", "times")
         return next((key for key in keys if getattr(self, key) is not None), None)
 
@@ -88,7 +88,6 @@ class HingeTable(Table):
         return super().in_dimension(dimension, path)
 
     def course(self, name: str) -> Knots | None:
-        """Return the curve of the motor's torque or speed over time, or None for a constant."""
         values = getattr(self, f"{name}s")
         return None if values is None else Knots(np.array(self.times), np.array(values))
 
@@ -108,8 +107,6 @@ class Hold:
 
     @classmethod
     def of(cls, table: SolidTable, dimension: int, hinges: Sequence[HingeTable] = ()) -> Self:
-        """Return the degrees of freedom of a free body. The hinge of the body, or the key `freedom` of its table,
-        determines them."""
         for hinge in hinges:
             if hinge.solid == table.name and hinge.to is None:
                 arm = in_frame(table, hinge.position)
@@ -130,8 +127,7 @@ def _three(vector: Any) -> Three:
 
 
 def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
-    """Return the inertia of a body about its hinge (3, 3), in the body's frame. Without a hinge, return the inertia
-    about the centre of mass."""
+    """Return the inertia (3, 3) about the hinge, without a hinge about the centre of mass, in the body's frame."""
     arm = np.array(hold.arm)
     return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
@@ -142,7 +138,7 @@ def check_free_body(path: FieldPath, name: str, tables: Sequence[SolidTable]) ->
 
 
 def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dimension: int) -> None:
-    """Check the hinges of a scene. Hinges must belong to free bodies and must not form closed chains."""
+    """Check that hinges belong to free bodies and do not form closed chains."""
     joined = {solid.name: {solid.name} for solid in solids}  # the solids that hinges join to each
     for index, hinge in enumerate(hinges):
         path = ("hinge", index)
@@ -176,8 +172,7 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
 def number_of(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Create a scalar parameter. ``change`` is the typical change of the parameter if its value is 0 or may be
-    negative."""
+    """Create a scalar parameter. ``change`` is its typical change at the value 0, or if it may be negative."""
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:
         return np.where((np.asarray(at) == 0.0) | (values is Range.ANY), change, np.abs(at))
@@ -186,14 +181,12 @@ def number_of(
 
 
 def in_frame(table: SolidTable, place: Any) -> Points:
-    """Convert a point (d,) [m] of a solid from its initial position in space to the solid's frame."""
+    """Convert a point (d,) [m] from its initial position in space to the solid's frame."""
     return np.asarray((np.array(place) - table.middle()) @ table.turn(len(place)))
 
 
 @dataclass(frozen=True)
 class Begun:
-    """Initial pose of a solid."""
-
     middle: Points
     """Position of the solid's middle (3,) [m]."""
     turn: Points
@@ -217,7 +210,7 @@ class Link:
     against: int
     """Index of the second solid among all moving solids; -1 without a moving second solid."""
     other: int
-    """Index of the second solid among the free bodies. The index is -1 if the second solid is not a free body."""
+    """Index of the second solid among the free bodies; -1 for any other second solid."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +222,7 @@ class Joint(Link):
 
 
 def linked(link: Any, moved: Sequence[SolidTable]) -> tuple[SolidTable, SolidTable | None, tuple[str, int, int, int]]:
-    """Return the two solids of a spring or hinge, and the values of the fields of its `Link`. ``moved`` are all moving
-    solids of the scene."""
+    """Return both solids of a spring or hinge, and the fields of its `Link`. ``moved`` are all moving solids."""
     names, bodies = [one.name for one in moved], [one.name for one in moved if one.motion == "free"]
     against = names.index(link.to) if link.to in names else -1
     other = bodies.index(link.to) if link.to in bodies else -1
@@ -296,8 +288,6 @@ class SpringTable(Table):
 
 
 def check_springs(springs: Sequence[SpringTable], hinges: Sequence[HingeTable], solids: Sequence[SolidTable]) -> None:
-    """Check that springs refer to existing solids. Also check that all solids, hinges and springs have
-    different names."""
     names = [solid.name for solid in solids]
     for index, hinge in enumerate(hinges):
         if hinge.name in names:

@@ -35,19 +35,15 @@ class RheologyTable(Table):
     """Name of the law of viscosity."""
 
     def numbers(self, viscosity: float) -> dict[str, float]:
-        """Return the coefficients of the law by name. ``viscosity`` [Pa s] is the value of this key in the table of the
-        phase."""
+        """Return the coefficients of the law by name. ``viscosity`` is the dynamic viscosity of the phase [Pa s]."""
         return {name: value for name, value in self.model_dump().items() if name != "kind"}
 
     def thickest(self, viscosity: float) -> float:
-        """Return the greatest viscosity at any shear rate [Pa s]. ``viscosity`` [Pa s] is the value of this key in the
-        table of the phase."""
+        """Return the greatest viscosity at any shear rate [Pa s]."""
         return viscosity
 
 
 class Thinning(RheologyTable):
-    """Base of the laws of viscosity with a power of the shear rate."""
-
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
     """Exponent n of the law [-]. Fluid with n < 1 is shear-thinning, and fluid with n > 1 is shear-thickening."""
     least_shear_rate: Annotated[float, quantity("1/s", gt=0.0)] = 0.01
@@ -62,7 +58,6 @@ class PowerLaw(Thinning):
     `viscosity` of the phase is the viscosity at a shear rate of 1/s."""
 
     kind: Literal["power_law"] = "power_law"
-    """Name of the law of viscosity."""
 
 
 class Carreau(RheologyTable):
@@ -71,7 +66,6 @@ class Carreau(RheologyTable):
     """
 
     kind: Literal["carreau"] = "carreau"
-    """Name of the law of viscosity."""
     relaxation_time: Annotated[float, quantity("s", ge=0.0)]
     """Relaxation time [s]. The viscosity begins to change at the shear rate 1 / relaxation_time."""
     flow_index: Annotated[float, quantity(gt=0.0, le=3.0)]
@@ -84,8 +78,6 @@ class Carreau(RheologyTable):
 
 
 class Yielding(RheologyTable):
-    """Base of the laws of viscosity with a yield stress."""
-
     yield_stress: Annotated[float, quantity("Pa", ge=0.0)]
     """Yield stress [Pa]. At lower stress the fluid hardly flows."""
     regularisation: Annotated[float, quantity("s", gt=0.0)] | None = None
@@ -107,7 +99,6 @@ class Bingham(Yielding):
     exp(-regularisation shear_rate)) / shear_rate. The key `viscosity` of the phase is the viscosity of fast flow."""
 
     kind: Literal["bingham"] = "bingham"
-    """Name of the law of viscosity."""
 
 
 class HerschelBulkley(Yielding, Thinning):
@@ -115,7 +106,6 @@ class HerschelBulkley(Yielding, Thinning):
     consistency."""
 
     kind: Literal["herschel_bulkley"] = "herschel_bulkley"
-    """Name of the law of viscosity."""
 
 
 AnyRheology = Annotated[PowerLaw | Carreau | Bingham | HerschelBulkley, Field(discriminator="kind")]
@@ -155,7 +145,6 @@ class DiscretisationTable(Table):
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
     """Name of the smoothing kernel. With the solver "projection" the default is "wendland_c2", unless the support is
     given."""
-
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """Largest random offset of a particle from its initial position, along each axis, in spacings. The offsets are
     equal in all runs. With the solver "projection" and all axes periodic the default is 0.05, because fluid on an exact
@@ -268,8 +257,6 @@ class SceneTables(Table):
 
     @property
     def periods(self) -> tuple[Points, Points]:
-        """Return the lower corner (d,) [m] and the lengths (d,) [m] of the periodic box. The length is 0 along an axis
-        that is not periodic."""
         return self.container.periods(self.dimension)
 
     @property
@@ -278,7 +265,7 @@ class SceneTables(Table):
 
     @property
     def region(self) -> Region:
-        """Return the region inside the container. The region is unbounded along periodic axes."""
+        """Return the region inside the container, unbounded along periodic axes."""
         return self.container.region(self.dimension).opened(self.periods[1])
 
     @property
@@ -288,7 +275,7 @@ class SceneTables(Table):
 
     @property
     def resting_room(self) -> Room:
-        """Return the region inside the container and outside the solids at rest. Moving solids are ignored."""
+        """Return the region inside the container and outside the solids at rest."""
         return replace(self.room, solids=solids_of(tuple(solid for solid in thick(self.solid) if not solid.moves)))
 
     @model_validator(mode="before")

@@ -59,7 +59,6 @@ class Course(Table):
 
     @property
     def knots(self) -> Knots:
-        """Return the values (k, components) over time as a curve. Raise `InputError` for an invalid file."""
         if self.file is None:
             times, values = np.array(self.times), np.array(self.values, dtype=np.float64)
         else:
@@ -137,8 +136,8 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the number of each solid by its name. Moving solids have the numbers 0, 1, ..., and solids at rest have
-    -2, -3, .... Wall particles store these numbers."""
+    """Return the numbers that wall particles store, by name of the solid. Moving solids have the numbers 0, 1, ..., and
+    solids at rest have -2, -3, ...."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
@@ -154,16 +153,14 @@ def free(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the initial positions (k, d) [m] of the middles of k moving solids, and their initial rotation matrices
-    (k, d, d)."""
+    """Return the initial middles (k, d) [m] and rotation matrices (k, d, d) of k moving solids."""
     tables, d = moving(scene.solid), scene.dimension
     middles = np.array([table.middle() for table in tables]).reshape(-1, d)
     return middles, np.array([table.turn(d) for table in tables]).reshape(-1, d, d)
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """Return the greatest speed of any point on the solids [m/s]. Parameters in ``values`` replace the parameters of
-    the scene."""
+    """Return the greatest speed of any point on the solids [m/s]. ``values`` replace parameters of the scene."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)
@@ -176,43 +173,32 @@ def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> f
 
 
 def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
-    """Return an upper bound on the distance of a solid's points from its middle [m]. Parameters in ``values`` replace
-    the parameters of the scene."""
+    """Return an upper bound on the distance of a solid's points from its middle [m]."""
     furthest = np.abs(solid.own_solid().extent()).max(axis=0)
     return float(np.linalg.norm(furthest) * values.get(scale_name(solid.name), 1.0))
 
 
 position_name = ending("position")
-"""Parameter: initial position of the solid's middle [m]. Field: current position."""
+"""Name of the parameter for the initial position of a solid's middle, and of the field for the current one [m]."""
 rotation_name = ending("rotation")
-"""Name of a parameter and of a state field: initial rotation of a solid [rad]."""
 scale_name = ending("scale")
-"""Name of a parameter and of a state field: scale factor of the solid's size."""
 displacement_name = ending("displacement")
-"""Name of a parameter: displacement of the solid's middle since the start [m]."""
 turn_name = ending("turn")
-"""Name of a parameter and of a state field: rotation of a solid since the start [rad]."""
 velocity_name = ending("velocity")
-"""Parameter: velocity of the solid's middle, for a free body at the start [m/s]. Field: velocity of a free body."""
 angular_velocity_name = ending("angular_velocity")
-"""Parameter: angular velocity, for a free body at the start [rad/s]. Field: angular velocity of a free body."""
 density_name = ending("density")
 mass_name = ending("mass")
 friction_name = ending("friction")
-"""Name of a parameter: coefficient of friction of a free body [-]."""
 restitution_name = ending("restitution")
-"""Name of a parameter: coefficient of restitution of a free body [-]."""
 
 
 def weight_name(solid: SolidTable) -> str:
-    """Return the name of the parameter for a free body's density [kg/m3] or mass [kg]. The table of the body has either
-    a density or a mass."""
+    """Return the name of the parameter for density [kg/m3] or mass [kg], whichever the table of the body has."""
     return (density_name if solid.mass is None else mass_name)(solid.name)
 
 
 def mass_of_one(solid: SolidTable) -> Mass:
-    """Return the mass and inertia of a free body with the density 1. If the table of the body has a mass, return them
-    for the mass 1."""
+    """Return the mass and inertia of a free body for the density 1, or for the mass 1 if its table has a mass."""
     even = Mass.of(solid.shape_about()[0])
     size = even.volume if solid.mass is None else 1.0
     if solid.inertia is not None:
@@ -231,11 +217,6 @@ def solids_in(fields: Iterable[str]) -> list[str]:
 
 
 def motion_parameters(solids: Sequence[SolidTable]) -> list[Parameter]:
-    """Return the parameters of moving solids.
-
-    Solids with prescribed motion have parameters for pose, size and motion. Free bodies have parameters for initial
-    motion, density or mass, friction and restitution.
-    """
     known = {parameter.name: parameter for solid in moving(solids) for parameter in _parameters(solid)}
     names = (position_name, rotation_name, scale_name, displacement_name, turn_name)
     found = [known[name(solid.name)] for solid in told(solids) for name in names]
@@ -288,7 +269,7 @@ def _parameters(solid: SolidTable) -> list[Parameter]:
 
 
 def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
-    """Return two curves over time for a solid with prescribed motion: its displacement [m] and its rotation [rad]."""
+    """Return the displacement [m] and the rotation [rad] of a solid with prescribed motion over time."""
     d = len(solid.middle())
     times, shifts, turns = path_of(solid, d) or (None, None, None)
 
@@ -304,16 +285,13 @@ def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a moving solid. The rotation matrix (3, 3) of the pose is `turned` times the matrix of the initial
-    rotation."""
+    """Pose of a moving solid. Its rotation matrix (3, 3) is `turned` times the matrix of `begun`."""
 
     name: str
     is_free: bool
-    """True for a free body, False for a solid with prescribed motion."""
     position: NDArray[Any]
     """Position of the solid's middle (d,) [m]."""
     scale: float
-    """Scale factor of the solid's size."""
     begun: NDArray[Any]
     """Rotation vector of the solid at the start (3,) [rad]."""
     turn: NDArray[Any]
@@ -323,8 +301,7 @@ class Pose:
 
     @classmethod
     def of(cls, name: str, is_free: bool, at: Any) -> Self:
-        """Read the pose of a solid from the fields ``at`` of a state. Each field is an array with a first axis of
-        length 1."""
+        """Read a pose from state fields ``at``, which are arrays with a first axis of length 1."""
         position, begun, turn, scale = at[position_name(name)][0], at[rotation_name(name)][0], np.zeros(3), 1.0
         if is_free:
             turned = np.eye(3) + np.array([_in_space(at[f"{name}.{axis}"][0]) for axis in AXES]).T
@@ -345,13 +322,11 @@ class Pose:
         return np.asarray(_angles(Rotation.from_matrix(self.rotation).as_rotvec(), len(self.position)).ravel())
 
     def angle_bars(self, bar: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return the derivatives with respect to state fields, by field name. ``bar`` is the derivative with respect to
-        `angles`."""
+        """Return the adjoints of state fields by name. ``bar`` is the adjoint of `angles`."""
         return self.turning_bars(np.linalg.solve(_jacobian(_in_space(self.angles)).T, _in_space(bar)))
 
     def turning_bars(self, t: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return the derivatives with respect to state fields, by field name. ``t`` (3,) is the derivative with respect
-        to a small additional rotation."""
+        """Return the adjoints of state fields by name. ``t`` (3,) is the adjoint of a small additional rotation."""
         name, dimension = self.name, len(self.position)
         bars = {rotation_name(name): _angles(_jacobian(self.begun).T @ self.turned.T @ t, dimension)}
         if not self.is_free:

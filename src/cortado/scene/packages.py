@@ -1,7 +1,6 @@
-"""Solvers and forces of installed packages for scene files.
+"""Solvers and forces of installed packages, which register them by entry points, for scene files.
 
-Packages register solvers and forces by entry points. Cortado reads entry points only if a scene names a kind that
-Cortado does not have. Error messages begin with the name of the package.
+Cortado reads entry points only if a scene names a kind that Cortado does not have.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -43,10 +42,10 @@ def _in_words(problem: BaseException, package: str) -> str:
 def guarded(
     what: str, package: str, error: type[CortadoError] = InputError, expected: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Convert an exception in a package to the exception class ``error``. The new message begins with ``what``.
+    """Convert an exception in a package to an ``error`` whose message begins with ``what``.
 
-    Errors of Cortado, keyboard interrupts and ``expected`` exceptions pass unchanged. If the package tries to end the
-    process, an ``error`` is raised as well.
+    Errors of Cortado, keyboard interrupts and ``expected`` exceptions pass unchanged. An attempt to end the process is
+    converted too.
     """
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
@@ -61,8 +60,6 @@ class PackageMaker:
     """A solver or force of an installed package. Error messages name the package."""
 
     def __init__(self, part: Any, kind: str, package: str):
-        """Wrap ``part``, a solver or force. ``kind`` is its name in scene files, and ``package`` the name of the
-        package in error messages."""
         self._part, self._kind, self._package = part, kind, package
 
     def __getattr__(self, name: str) -> Any:
@@ -140,12 +137,11 @@ def _is_ours(function: Any) -> bool:
 
 MOST = 1_000_000_000
 TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, MOST)], bool: Flag, str: Text}
-"""Pydantic type that checks a key, for each type of a factory's argument."""
+"""Pydantic type that checks a key, by type of the argument of a factory."""
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
-    """Return the entry point ``kind`` in a group such as "cortado.forces". Raise a `SceneError` if no package has
-    registered ``kind``, or if ``own``, the names that Cortado uses, contains ``kind``."""
+    """Return the entry point ``kind`` in a group such as "cortado.forces". ``own`` are names that Cortado uses."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)
@@ -171,7 +167,6 @@ def _package_of(entry: EntryPoint) -> str:
 
 
 def loaded(entry: EntryPoint) -> Callable[..., Any]:
-    """Import the class or function of an entry point. Raise a `SceneError` if this fails."""
     where = f"is {shown(entry.name)}, for which {_package_of(entry)} registers {entry.value}"
     with _told("kind", entry, f"{where}, but that cannot be imported:"):
         found = entry.load()
@@ -195,8 +190,6 @@ def _told(field: str, entry: EntryPoint, what: str) -> Iterator[None]:
 
 
 def checked_keys(factory: Callable[..., Any], keys: Mapping[str, Any], reserved: Collection[str]) -> dict[str, Any]:
-    """Return the arguments of a factory after a check of their types. Raise a `SceneError` about the first
-    invalid key."""
     arguments = _arguments(factory)
     if arguments is None:
         return dict(keys)
@@ -247,8 +240,7 @@ def _adapter(argument: Argument) -> tuple[TypeAdapter | None, str]:
 
 
 def made(entry: EntryPoint, factory: Callable[..., Any], keys: Mapping[str, Any], method: str) -> Any:
-    """Make a solver or force from the keys of a table. Raise a `SceneError` if this fails, or if the object has no
-    method ``method``."""
+    """Make a solver or force from the keys of a table. The object must have a method named ``method``."""
     called = f'of the kind "{entry.name}"'
     with _told("", entry, f"{called} cannot be made:"):
         found = factory(**keys)
@@ -267,7 +259,6 @@ class PackageTable(Table):
     group: ClassVar[str]
     method: ClassVar[str]
     own: ClassVar[Collection[str]] = ()
-    """Names that Cortado uses and that packages cannot use."""
     advice: ClassVar[str] = ""
     kind: Text
     """Name under which the package registers the solver or force."""

@@ -1,4 +1,4 @@
-"""Checks of parameter values, and gravity as a function of tilt angles. All computations use NumPy in float64."""
+"""Checks of parameter values, and gravity as a function of tilt angles, with NumPy in float64."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from cortado.scene.parameters import BY_NAME, Axis, Parameter, Range, Role, Sour
 
 
 def reference_density(fractions: np.ndarray, rest_density: np.ndarray) -> np.ndarray:
-    """Return the rest densities of mixtures (n,) from mass fractions (n, phases) and rest densities (phases,)
+    """Return the rest density (n,) of mixtures, given mass fractions (n, phases) and rest densities (phases,)
     [kg/m3]."""
     return 1.0 / (fractions / rest_density).sum(axis=1)
 
@@ -29,8 +29,7 @@ def reference_density_tangent(
 def reference_density_adjoint(
     fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the adjoints of mass fractions (n, phases) and rest densities (phases,), given the adjoint of the
-    mixture's density (n,)."""
+    """Return the adjoints of both arguments, given the adjoint of the density of mixtures (n,)."""
     by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
     return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
 
@@ -44,8 +43,7 @@ class Tilt:
     """Gravity as a function of tilt angles (d - 1,) [degrees].
 
     Gravity along -y turns towards x by the first angle and towards z by the second angle. The function is the
-    exponential map of the sphere. The exponential map is smooth at zero tilt, and invertible for angles below 180
-    degrees.
+    exponential map of the sphere, which is smooth at zero tilt and invertible below 180 degrees.
     """
 
     rest: tuple[float, ...]
@@ -92,8 +90,7 @@ class Tilt:
 
     @staticmethod
     def _factors(a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factor sin|a| / |a| (..., 1) for angles a. Also return the derivative of the factor with respect
-        to |a|, divided by |a|."""
+        """Return the factor sin|a| / |a| (..., 1), and the derivative of the factor by |a|, divided by |a|."""
         size = np.linalg.norm(a, axis=-1, keepdims=True)
         sine, safe = np.sinc(size / np.pi), np.maximum(size, SMALL)
         derivative = (np.cos(safe) - np.sinc(safe / np.pi)) / safe**2
@@ -106,11 +103,9 @@ class Known(FixedDict):
     __eq__, __ne__, __hash__ = object.__eq__, object.__ne__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """Add ``own``, the parameters of forces and of a solver. Each parameter in ``own`` comes with a description of
-        its force or solver.
+        """Add ``own``: parameters of forces and of a solver, each with a description of its force or solver.
 
-        Raises `InputError` if two parameters have the same name, or if a name is reserved. The parameter `TIME` may
-        occur several times.
+        Raises `InputError` for a name that occurs twice. Only the parameter `TIME` may occur several times.
         """
         self._given = dict(own)
         found, arguments = dict(BY_NAME), {argument(name): name for name in BY_NAME}
@@ -125,11 +120,8 @@ class Known(FixedDict):
         super().__init__(found)
         self.own = tuple(p for p in self.values() if p.name not in BY_NAME)
         self.run = tuple(name for name, p in self.items() if p.role in (Role.RUN, Role.CLOCK))
-        """Names of parameters that the time steps use."""
         self.state = tuple(name for name, p in self.items() if p.role is Role.STATE)
-        """Names of parameters of the initial state."""
         self.over_time = tuple(name for name, p in self.items() if p.axis is Axis.STEP)
-        """Names of parameters that may change from step to step."""
         self.vectors = tuple(name for name in self.run if self[name].components is not None)
         self.views = {p.name: p.in_place_of for p in self.values() if p.in_place_of is not None}
         """Names of alternative parameters, such as a tilt, with the names of the parameters that they replace."""
@@ -174,8 +166,7 @@ SUM_TOLERANCE = 0.01
 
 
 def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
-    """Return the values of the ``known`` parameters in a scene. Alternative parameters, such as a tilt, are
-    left out."""
+    """Return the values of parameters in a scene, without alternative parameters such as a tilt."""
     phases, positions = len(source.scene.phase), source.positions.shape
     found = {}
     for name, parameter in known.items():
@@ -186,7 +177,6 @@ def scene_values(source: Source, known: Known = REGISTRY) -> Arrays:
 
 
 def check_known(name: str, scene: Any, what: str = "parameter", known: Known = REGISTRY) -> None:
-    """Raise `InputError` for a parameter that does not exist in this scene."""
     if name not in known or known[name].role is Role.CLOCK:
         owner = str(name).rpartition(".")[0]
         if owner in (solid.name for solid in scene.solid if not solid.moves):
@@ -200,8 +190,7 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 
 def require_points(points: Any, are_read: bool = True) -> None:
-    """Raise `InputError` if ``points`` is not a list of tables of parameters. If ``are_read`` is false, ``points`` may
-    be any iterable, and the tables are not checked."""
+    """Check ``points``. If ``are_read`` is false, any iterable is allowed, and its tables are not checked."""
     is_fit = isinstance(points, Sequence) and len(points) > 0 if are_read else isinstance(points, Iterable)
     if not is_fit or isinstance(points, (str, bytes, Mapping)):
         raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")
@@ -220,8 +209,8 @@ def checked_value(
 ) -> np.ndarray:
     """Return a value as a float64 array, after a check of its shape and range.
 
-    Raise `OutOfRangeError` if the shape is valid but a number is out of range. Raise `InputError` for any other error.
-    Numbers may be negative if ``what`` is "direction".
+    Raise `OutOfRangeError` if only a number is out of range, and `InputError` for any other error. Numbers may be
+    negative if ``what`` is "direction".
     """
     array, parameter = as_numbers(f"{what} {name}", value), known[name]
     unit = f" in {parameter.unit}" if parameter.unit else ""

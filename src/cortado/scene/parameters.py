@@ -114,7 +114,6 @@ def _vector(dimension: int, phases: int) -> int:
 
 
 def of_part(name: str, unit: str, meaning: str, value: Any, axis: Axis = Axis.SCALAR, **more: Any) -> Parameter:
-    """Build a parameter that belongs to one object of a scene, such as a solid."""
     own = np.asarray(value, dtype=np.float64)
     return Parameter(name, unit, meaning, axis, lambda source: own, components=_vector if own.ndim else None, **more)
 
@@ -137,7 +136,6 @@ def _has_several_phases(scene: Any) -> bool:
 
 
 def _of_particles(name: str, unit: str, meaning: str, value: Callable[[Source], Any], **more: Any) -> Parameter:
-    """Build a parameter of the particles' initial state."""
     more = {"components": _vector, "role": Role.STATE, **more}
     return Parameter(name, unit, meaning, Axis.PARTICLE, value, **more)
 
@@ -243,7 +241,6 @@ def names(role: Role | None = None, axis: Axis | None = None) -> tuple[str, ...]
 
 
 def offered(scene: Any) -> tuple[str, ...]:
-    """Return the names of the parameters that a scene has."""
     one_phase = {"mass_fractions"} if len(scene.phase) == 1 else set()
     return tuple(p.name for p in PARAMETERS if p.present(scene) and p.name not in one_phase)
 
@@ -282,8 +279,7 @@ NAMES = tuple(QUANTITIES)
 
 
 def sizes(name: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return scalar values (..., n) unchanged, or the norms of vectors (..., n, k). ``name`` is the name of a particle
-    quantity or of a field of the state."""
+    """Return scalars (..., n) unchanged, or norms of vectors (..., n, k). ``name`` is a quantity or a state field."""
     known = QUANTITIES.get(name)
     is_vector = values.ndim == 2 if known is None else len(known.shape(1, dimension)) == 2
     return np.linalg.norm(values, axis=-1) if is_vector else values
@@ -297,24 +293,21 @@ LOAD = ".load"
 
 
 def load_name(solid: str) -> str:
-    """Return the name of the fluid load on ``solid``, such as "rotor.load". A load is a force [N] and a torque [N m],
-    in 2-D [N/m] and [N]."""
+    """Return the name of the fluid load, such as "rotor.load": force [N] and torque [N m], in 2-D [N/m] and [N]."""
     return f"{solid}{LOAD}"
 
 
 def is_load(name: object) -> bool:
-    """Test if a name has the form that `load_name` returns."""
     return isinstance(name, str) and name.endswith(LOAD)
 
 
 def check_readable(name: object, what: str, fields: tuple[str, ...]) -> str:
-    """Return ``name`` if it names a quantity, one of ``fields``, or a load on a solid. Raise `InputError` for any other
-    name."""
+    """Return ``name`` if it names a quantity, a load or one of ``fields``; else raise `InputError`."""
     return str(name) if is_load(name) else check_quantity(name, what, fields)
 
 
 def check_quantity(name: object, what: str = "quantity", others: tuple[str, ...] = ()) -> str:
-    """Return ``name`` if it names a quantity or is one of ``others``. Raise `InputError` for any other name."""
+    """Return ``name`` if it names a quantity or is one of ``others``; else raise `InputError`."""
     if not isinstance(name, str) or name not in (*others, *NAMES):
         raise InputError(f"{what} is {shown(name)}, but must be one of {', '.join((*others, *NAMES))}.")
     return name

@@ -2,8 +2,7 @@
 
 The libraries VTK and HDF5 trust the contents of a file. A damaged file may make them hang, use all memory or crash. A
 separate process with limited time and memory, ``python -m cortado.scene.point_files FILE``, therefore reads such files.
-The process writes the points (n, 3) or (n, 2) in NumPy's format to standard output. If the process refuses a file, it
-writes the reason and ends with the exit code `REFUSED`.
+It writes the points (n, 3) or (n, 2) in NumPy's format to standard output, or a reason with the exit code `REFUSED`.
 """
 
 import io
@@ -98,7 +97,6 @@ def _check_count(count: int) -> None:
 
 
 def main(path: str) -> int:
-    """Read a file of points, write them for the parent process, and return the exit code."""
     output, nothing = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     for terminal in (1, 2):
         os.dup2(nothing, terminal)
@@ -156,7 +154,6 @@ def _check_form(path: str, shape: tuple[int, ...], dtype: np.dtype[Any], dimensi
 
 
 def _read_npy(path: str, dimension: int) -> Any:
-    """Read the array of a NumPy file."""
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     try:
         with open(path, "rb") as file, warnings.catch_warnings():

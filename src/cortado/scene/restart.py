@@ -14,8 +14,6 @@ from cortado.errors import InputError, shown
 
 @dataclass(frozen=True)
 class Clock:
-    """Time of a state since the first state."""
-
     steps: int = 0
     """Number of steps since the first state."""
     time: float = 0.0
@@ -28,14 +26,11 @@ class Clock:
         return (self.time - self.steps * time_step) + (self.steps + steps) * time_step
 
     def after(self, steps: int, time_step: float) -> "Clock":
-        """Return the clock after ``steps`` further steps."""
         return Clock(self.steps + steps, float(self.times(steps, time_step)))
 
 
 @dataclass(frozen=True)
 class RecordedClock(Clock):
-    """Clock of a run with adaptive time steps."""
-
     recorded: NDArray = field(default_factory=lambda: np.zeros(1), repr=False, compare=False)
     """Time of each state (steps + 1,) [s]."""
     sizes: NDArray = field(default_factory=lambda: np.zeros(0), repr=False, compare=False)
@@ -53,8 +48,7 @@ class RecordedClock(Clock):
 
 @dataclass(frozen=True)
 class Origin:
-    """Properties of the scene in which a state was computed. A run can start from the state only in a scene with equal
-    properties."""
+    """Properties of the scene of a state. A run can start from the state only in a scene with equal properties."""
 
     spacing: float
     """Particle spacing [m]."""
@@ -75,7 +69,6 @@ class Origin:
 
     @classmethod
     def from_json(cls, text: str) -> "Origin":
-        """Read the JSON of `to_json`. Raise `ValueError` or `TypeError` for invalid text."""
         read: dict[str, Any] = json.loads(text)
         values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in read.items()}
         return cls(**values)

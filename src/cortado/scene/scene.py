@@ -109,8 +109,7 @@ class Scene(SceneTables):
         return json.dumps(self.model_dump(mode="json"), indent=2)
 
     def computed_json(self) -> str:
-        """Return as JSON the part of the scene that determines the results of a simulation. Pictures, sensors and
-        materials are left out."""
+        """Return as JSON only what determines the results of a simulation, without pictures, sensors and materials."""
         aside: dict[str, Any] = {"picture": True, "sensor": True}
         lists = ("force", "solid", "hinge", "spring", "emitter", "drain")
         aside |= {name: True for name in lists if not getattr(self, name)}
@@ -183,8 +182,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> S
 
 
 def as_scene(scene: Scene | str | os.PathLike[str]) -> Scene:
-    """Return a scene unchanged, or read the scene file at a path. Raise `InputError` for an object of any
-    other type."""
+    """Return a scene unchanged, or read the scene file at a path."""
     if isinstance(scene, Scene):
         return scene
     if isinstance(scene, (str, os.PathLike)):
@@ -205,8 +203,7 @@ def scene_from_dict(data: Mapping[str, Any], file: str | None = None) -> Scene:
 
 
 def files_named(tables: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """Return all tables of a scene that name a file, each with the key of the file name. ``tables`` are as in
-    `Scene.to_json`."""
+    """Return the tables that name a file, each with its key for the file. ``tables`` is a parsed `Scene.to_json`."""
     found = [*(tables.get("solid") or ()), *(tables.get("fluid") or ()), *(tables.get("schedule") or {}).values()]
     found += [one["path"] for one in tables.get("emitter") or ()]
     return [(table, key) for table in found if table for key in ("file", "path") if table.get(key)]
@@ -287,7 +284,6 @@ def _table_of(override: str) -> str:
 
 
 def _beside(file: str) -> str | None:
-    """Return the scene file with the most similar name in the folder of a missing file, or None."""
     folder, name = os.path.split(file)
     try:
         names = [one for one in os.listdir(folder or ".") if one.endswith(".toml")]
@@ -298,7 +294,6 @@ def _beside(file: str) -> str | None:
 
 
 def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Sequence[str] = ()) -> dict[str, Any]:
-    """Apply overrides to the contents of a file. Raise `SceneError` for an invalid override."""
     if isinstance(overrides, str):
         sentence = f"must be in a list, as [{shown(overrides)}], as there may be several overrides."
         raise SceneError(file, shown(overrides), sentence=sentence)

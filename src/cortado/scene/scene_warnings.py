@@ -29,7 +29,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Yield each of the field ``names`` for which the table has a value other than the default."""
+    """Yield each of ``names`` for which the table has a value other than the default."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -37,21 +37,19 @@ def given(table: Table, *names: str) -> Iterator[str]:
 
 
 def check_idle(scene: SceneTables) -> None:
-    """Raise a `field_error` for the first key without effect."""
     for path, table, names, reason in _idle(scene):
         for name in given(table, *names):
             raise field_error((*path, name), getattr(table, name), f"left out, as {reason}")
 
 
 def idle_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield warnings about keys without effect."""
     for path, table, names, reason in _turned_off(scene):
         for name in given(table, *names):
             yield f"{field_name((*path, name))} changes nothing, as {reason}."
 
 
 Idle = tuple[FieldPath, Table, tuple[str, ...], str]
-"""A table with keys that have no effect: the table's path, the table, the names of the keys, and the reason."""
+"""The path of a table, the table, names of its keys without effect, and the reason."""
 
 
 def _idle(scene: SceneTables) -> Iterator[Idle]:
@@ -120,7 +118,6 @@ def _turned_off(scene: SceneTables) -> Iterator[Idle]:
 
 
 def creep_sentence(scene: SceneTables) -> str | None:
-    """Return a warning about the creep of fluid with a yield stress, or None."""
     phase, law = scene.phase[0], scene.phase[0].rheology
     if not isinstance(law, Yielding) or law.yield_stress == 0.0 or not scene.fluid:
         return None
@@ -135,8 +132,7 @@ def creep_sentence(scene: SceneTables) -> str | None:
 
 
 def viscosity_sentence(scene: SceneTables, where: str) -> str | None:
-    """Return a warning about the inaccurate pairwise viscosity, or None. The text ``where`` begins the warning and
-    names what the error affects."""
+    """Return a warning that begins with the text ``where``, or None if viscosity is accurate."""
     if scene.forces.viscosity != "pairwise":
         return None
     fault = "with which fluid is 0.6 to 1.4 times as viscous as asked for, by the direction of the shear"
@@ -184,8 +180,7 @@ def _stays(table: SolidTable, axis: int, spacing: float) -> bool:
 ONE_LAYER, TWO_LAYERS = 1.1, 1.5
 """Smallest thickness of a leak-proof solid, for one and for two layers of wall particles [spacings]."""
 DEPTHS = np.arange(1, 9) / 8.0
-"""Depths below the surface of a solid at which its thickness is tested, as fractions of the smallest allowed
-thickness."""
+"""Depths at which the thickness of a solid is tested, as fractions of the smallest allowed thickness."""
 MARGIN = 1e-3
 """Tolerance of the thickness, as a fraction of the smallest allowed thickness."""
 SHARE = 0.01
@@ -193,7 +188,6 @@ SHARE = 0.01
 
 
 def thin_sentences(scene: SceneTables) -> Iterator[str]:
-    """Yield warnings about solids that are too thin to separate the fluid on their two sides."""
     cut = scene.discretisation
     spacing, least = cut.spacing, (ONE_LAYER if cut.support <= 2.0 else TWO_LAYERS) * cut.spacing
     for table in thick(scene.solid) if scene.forces.pressure else ():

@@ -69,8 +69,7 @@ def _limits(schema: Schema) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit of a dotted key, such as "Pa s" for ``phase.0.viscosity``. Return an empty text for a key without
-    a unique unit."""
+    """Return the unit of a key such as ``phase.0.viscosity``. The text is empty for a key without a unique unit."""
     found = list(_choices(_schema()))
     for part in key.split("."):
         found = [choice for one in found for choice in _choices(_part(one, part))]
@@ -118,7 +117,6 @@ class Documented(ModelMetaclass):
 
     @property
     def __signature__(cls) -> Signature:
-        """Signature with the keys and their default values."""
         found = []
         for name, field in vars(cls)["__pydantic_fields__"].items():
             default = Parameter.empty if field.is_required() else field.get_default(call_default_factory=True)

@@ -91,7 +91,6 @@ class CylinderShape(Table):
 
     @property
     def along(self) -> int:
-        """Return the index of the axis."""
         return INDEX_OF_AXIS[self.axis]
 
     def shape_about(self) -> tuple[Solid, Points]:
@@ -136,7 +135,6 @@ class MeshShape(Table):
         return _about_middle(mesh_in_file(self.file), self.scale)
 
     def thinnest(self, spacing: float) -> float:
-        """Return the thickness of the thinnest sheet [m]; infinite without sheets."""
         return _thickness(self.shape_about()[0], THIN * spacing)
 
 
@@ -158,8 +156,7 @@ def surface_cells(lower: Points, upper: Points, spacing: float) -> float:
 
 
 def _crossing(corners: Points) -> tuple[int, int] | None:
-    """Return the indices of two crossing sides of a polygon, or None. If a side has length 0, its index is returned
-    twice."""
+    """Return the indices of two crossing sides of a polygon, or twice the index of a side without length."""
     count, sides = len(corners), np.roll(corners, -1, axis=0) - corners
 
     def turned(a: Points, b: Points) -> float:
@@ -188,16 +185,13 @@ class Container(Table):
     """Appearance of the walls in pictures; None for the default appearance."""
 
     def extent(self) -> tuple[Points, Points] | None:
-        """Return the lower and the upper corner (d,) [m] of the container's bounding box. Return None for free
-        space."""
+        """Return the lower and the upper corner (d,) [m] of the bounding box; None for free space."""
         return None
 
     def region(self, dimension: int) -> Region:
-        """Return the region for fluid inside the container."""
         return Region.everywhere(dimension)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test for each of ``points`` (n, d) [m] if it is in the container, with a ``tolerance`` [m]."""
         return self.region(points.shape[1]).contains(points, tolerance)
 
     def walls(self, dimension: int, spacing: float, depth: float) -> Points:
@@ -209,17 +203,12 @@ class Container(Table):
         return Places.upright(np.zeros((0, dimension)))
 
     def shortened(self, spacing: float, support: float) -> "tuple[Container, Callable[[Points], Points]]":
-        """Return a shorter container with wall particles of the same weights. ``spacing`` and ``support`` are in
-        metres.
-
-        Also return a function that maps points (b, d) [m] on the walls of this container to points on the walls of the
-        shorter container.
-        """
+        """Return a shorter container with wall particles of the same weights. Also return a function that maps points
+        (b, d) [m] on the walls of this container to the walls of the shorter container."""
         return self, lambda points: points
 
     def solids(self, dimension: int, reach: float) -> tuple[Solid, ...]:
-        """Return the solids that form the walls of the container. At periodic ends the solids are extended by ``reach``
-        [m]."""
+        """Return the solids that form the walls. At periodic ends the solids are extended by ``reach`` [m]."""
         return ()
 
     def wall_count(self, spacing: float) -> float:
@@ -227,13 +216,12 @@ class Container(Table):
         return 0.0 if ends is None else surface_cells(*ends, spacing)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Return the lower corner (d,) [m] and the lengths (d,) [m] of the periodic box. The length is 0 along an axis
-        that is not periodic."""
+        """Return the lower corner and the lengths (d,) [m] of the periodic box. Other axes have the length 0."""
         return np.zeros(dimension), np.zeros(dimension)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return the coordinates of the flat walls that mirror the fluid: lower walls (d,) and upper walls (d,) [m]. A
-        coordinate is infinite if no wall mirrors. ``support`` is the support radius [m]."""
+        """Return the coordinates of the lower and the upper flat walls that mirror the fluid, (d,) [m]. A coordinate is
+        infinite if no wall mirrors."""
         return np.full(dimension, -np.inf), np.full(dimension, np.inf)
 
     def domain(self, dimension: int) -> Domain:
@@ -300,8 +288,7 @@ class BoxContainer(Walled, BoxShape, Container):
         return box_places(*self.extent(), self.periodic, spacing, reach)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:
-        """Return the coordinates of the flat walls that mirror the fluid: lower walls (d,) and upper walls (d,) [m].
-        No-slip walls and walls of a very narrow box do not mirror."""
+        """No-slip walls and walls of a very narrow box do not mirror the fluid."""
         (lower, upper), periodic = self.extent(), np.array(self.periodic)
         if self.sticks or (upper - lower < support)[~periodic].any():
             return super().mirrors(dimension, support)
@@ -351,7 +338,6 @@ AnyContainer = Annotated[BoxContainer | CylinderContainer | NoContainer, Field(d
 
 
 def check_length(container: Container, spacing: float, support_radius: float) -> None:
-    """Check that a container is at least one spacing wide, and that a periodic box is longer than two support radii."""
     ends = container.extent()
     if ends is None:
         return

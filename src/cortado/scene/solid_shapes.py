@@ -32,7 +32,6 @@ class PlaneSolid(SolidTable):
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         turned = super().in_dimension(dimension, path)
-
         if self.side == "inside":
             raise field_error((*path, "side"), self.side, '"outside": fluid is where the normal of a plane points')
         if self.rotation is not None:

@@ -120,7 +120,7 @@ class SolidTable(Coloured):
         return self.shape_about()[1] if self.position is None else np.array(self.position)
 
     def middle(self) -> Points:
-        """Return the initial middle of the solid (d,) [m]: its centre of mass if given, else its centroid."""
+        """Return the solid's initial middle (d,) [m]: its centre of mass if given, else its centroid."""
         return self.centroid() + self._arm()
 
     def moved(self, middle: Points, rotation: tuple[float, ...]) -> Self:
@@ -129,14 +129,13 @@ class SolidTable(Coloured):
         return turned.model_copy(update={"position": tuple((middle - turned._arm()).tolist())})
 
     def _arm(self) -> Points:
-        """Return the initial vector from the centroid to the centre of mass (d,) [m]; zero (1,) if they coincide."""
+        """Return the vector from the centroid to the centre of mass (d,) [m]; zero (1,) if they coincide."""
         arm = self.centre_of_mass
         return np.zeros(1) if arm is None else np.asarray(self.turn(len(arm)) @ np.array(arm))
 
     @abstractmethod
     def shape_about(self) -> tuple[Solid, Points]:
-        """Return the shape with its centroid at the origin, without a rotation. Also return the centroid's position
-        (d,) [m]."""
+        """Return the unrotated shape with its centroid at the origin, and the centroid's position (d,) [m]."""
 
     def shown_shape(self, spacing: float) -> Solid:
         return self.shape_about()[0]
@@ -152,7 +151,7 @@ class SolidTable(Coloured):
         return np.inf
 
     def in_container(self, container: Container, path: FieldPath) -> Self:
-        """Return the table with an unbounded shape cut at the container. ``path`` is the table's path in the scene."""
+        """Return the table with an unbounded shape cut at the container."""
         return self
 
     def wall_count(self, spacing: float) -> float:
@@ -163,7 +162,7 @@ class SolidTable(Coloured):
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
     def own_solid(self) -> Solid:
-        """Return the region that fluid cannot enter, without a rotation and with the solid's middle at the origin."""
+        """Return the region that fluid cannot enter, unrotated and with the solid's middle at the origin."""
         shape = self.shape_about()[0]
         if self.centre_of_mass is not None:
             return Placed(shape, -np.array(self.centre_of_mass), np.eye(len(self.centre_of_mass)))

@@ -13,7 +13,6 @@ from cortado.scene.tables import Flag, OrWord, Table, Text, count, field_error, 
 OWN = ("projection", "pcisph")
 """Names of Cortado's solvers. The first solver is the default."""
 COURANT = 0.2
-"""Default Courant number."""
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]
 """Pairs of the name of a table and the default values of keys in this table."""
 
@@ -54,8 +53,7 @@ class SolverTable(Table):
         return self.time_step == "auto"
 
     def fixed_time_step(self, what: str) -> float:
-        """Return the fixed time step [s]. Raise `InputError` if time steps are adaptive; the message names ``what`` as
-        the reason."""
+        """Return the fixed time step [s]. Raise `InputError`, with ``what`` as the reason, for adaptive time steps."""
         if self.time_step == "auto":
             raise InputError(f'solver.time_step is "auto", but must be a number of seconds for {what}.')
         return self.time_step
@@ -65,7 +63,6 @@ class ProjectionSolver(SolverTable):
     """A solver that projects velocities to zero divergence. Its pressure may be negative inside the fluid."""
 
     kind: Literal["projection"] = "projection"
-    """Name of the algorithm."""
     iterations: Annotated[int, count(2, 1_000)] = 2
     """Number of pressure iterations in every step, or the minimum if `tolerance` is given."""
     tolerance: Annotated[float, quantity(gt=0.0)] | None = None
@@ -101,7 +98,6 @@ class PcisphSolver(SolverTable):
     """The solver PCISPH: predictive-corrective incompressible SPH."""
 
     kind: Literal["pcisph"]
-    """Name of the algorithm."""
     minimum_iterations: Annotated[int, count(1, 1_000_000)] = 3
     """Minimum number of pressure iterations in a step."""
     maximum_iterations: Annotated[int, count(1, 1_000_000)] = 50
@@ -132,8 +128,7 @@ class PackageSolver(SolverTable, PackageTable):
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """Return the default values that a solver sets in other tables. ``solver`` and ``container`` are tables or
-    dicts."""
+    """Return the defaults that a solver sets in other tables. Both arguments are tables or dicts."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
     periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)

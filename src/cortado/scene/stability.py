@@ -18,15 +18,13 @@ from cortado.scene.solvers import ProjectionSolver
 
 
 def greatest_fall(scene: SceneTables, gravity: Points) -> float:
-    """Return the greatest energy per mass [J/kg] that fluid can gain by a fall inside the container, for gravity (k, d)
-    [m/s2]."""
+    """Return the greatest energy per mass [J/kg] of a fall inside the container, for gravity (k, d) [m/s2]."""
     lower, upper = _extent(scene)
     return float((np.abs(gravity) @ (upper - lower)).max())
 
 
 def fall_to(scene: SceneTables, solid: SolidTable, gravity: Points, values: Arrays) -> float:
-    """Return the greatest energy per mass [J/kg] of fluid that falls to the lowest point of a solid, for gravity (k, d)
-    [m/s2]. Parameters in ``values`` replace parameters of the scene.
+    """Return the greatest energy per mass [J/kg] of a fall to the lowest point of a solid, for gravity (k, d) [m/s2].
 
     The fall begins at the highest point of initial fluid, free bodies and emitters. If gravity changes or the solid
     moves, the result is `greatest_fall`.
@@ -65,8 +63,7 @@ def _extent(scene: SceneTables) -> tuple[Points, Points]:
 
 
 VISCOUS_RATES = {"stress": (stress_rate, 0.5), "pairwise": (pairwise_rate, 0.65)}
-"""For each form of the viscous force: the function for the greatest viscous rate on a lattice, and the safety factor of
-the time step."""
+"""Function for the greatest viscous rate on a lattice, and safety factor, by form of the viscous force."""
 DEPTH_FACTORS = {"cubic_spline": 1.8, "wendland_c2": 1.6, "wendland_c4": 1.2}
 """Factors of the time step limit for deep fluid, by smoothing kernel."""
 RESTING, RUNNING = 0.63, 0.4
@@ -76,16 +73,14 @@ SOLID_STEP = 0.2
 """Greatest motion of a solid in a time step [spacings]."""
 FRICTION_STEP = 0.25
 """Greatest product of kinematic viscosity and time step beside no-slip free bodies [spacings²]."""
-
 BESIDE, THROUGH = 0.4, 0.25
 """Greatest motion of fluid beside a solid in a time step: in spacings, and as a fraction of the solid's thickness."""
 
 
 def chosen_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return upper bounds of adaptive time steps [s] by name. The bounds do not depend on the speed of the fluid.
+    """Return upper bounds of adaptive time steps [s] by name: `standing_limits` and the key ``greatest_time_step``.
 
-    The bounds are `standing_limits` and the key ``greatest_time_step``. If gravity changes, `gravity_limits` bounds
-    each time step separately.
+    If gravity changes, `gravity_limits` bounds each time step separately.
     """
     own = {name: value for name, value in (values or {}).items() if name != "gravity"}
     found = standing_limits(scene, own, [solid for solid in scene.solid if solid.is_steady])
@@ -109,8 +104,6 @@ def broken_limits(scene: SceneTables, values: Arrays, time_step: float) -> list[
 
 
 def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> str:
-    """Return advice for a run that diverged with this time step [s]. Parameters in ``values`` replace parameters of the
-    scene."""
     if scene.solver.chooses:
         return "try a smaller solver.courant or solver.greatest_time_step, or more pressure iterations"
     broken = broken_limits(scene, values, time_step)
@@ -132,8 +125,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
     Force: 0.25 sqrt(h / |g|) (Monaghan 1992).
 
-    Viscosity: a fraction of the longest stable explicit time step on a lattice; see `VISCOUS_RATES`. The estimate uses
-    the greatest viscosity and the smallest density of the phases.
+    Viscosity: a fraction of the longest stable explicit time step on a lattice; see `VISCOUS_RATES`.
 
     Depth: C s^(3/2) / (H sqrt(|g|)) for fluid of depth H, where the factor C is from `DEPTH_FACTORS`. With a coarse
     pressure grid, the limit is C s / sqrt(H |g|), where C is `RESTING` or `RUNNING`. In a tilted container, H is the
@@ -165,8 +157,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
 
 
 def standing_limits(scene: SceneTables, values: Arrays, solids: Sequence[SolidTable]) -> dict[str, float]:
-    """Return the stability limits [s] that do not depend on the speed of the fluid. ``solids`` are the moving
-    solids."""
+    """Return the stability limits [s] that do not depend on the speed of the fluid."""
     viscous = inf if is_implicit(scene) else viscous_limit(scene, values)
     own = {**_other_limits(scene, values), "viscosity": viscous}
     if (fastest := greatest_speed(solids, values)) > 0.0:
@@ -211,7 +202,6 @@ def _other_limits(scene: SceneTables, values: Arrays) -> dict[str, float]:
 
 
 def is_implicit(scene: SceneTables, values: Arrays | None = None) -> bool:
-    """Test if the viscous force is computed implicitly. Parameters in ``values`` replace parameters of the scene."""
     values = values or {}
     if scene.forces.viscosity != "stress" or scene.forces.viscous_solve == "explicit":
         return False

@@ -45,25 +45,22 @@ def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None =
 
 
 def check_name(path: FieldPath, name: str | None, names: Sequence[str], kind: str, otherwise: str = "") -> None:
-    """Raise a `field_error` if a name is not in ``names``. If ``names`` is empty, the message contains
-    ``otherwise``."""
+    """Raise a `field_error` if a name is not in ``names``. Without names the message is ``otherwise``."""
     if name not in names:
         raise field_error(path, name, f"the name of {kind}, of {shown(names)}" if names else otherwise)
 
 
 def quantity(unit: str = "-", *, gt: float | None = None, ge: float = -GREATEST, le: float = GREATEST) -> Any:
-    """Describe a field for a finite number with a unit. The unit "-" means that the number has no unit."""
+    """Describe a field for a finite number. The unit "-" means that the number has no unit."""
     least = ge if gt is None else max(ge, 1.0 / GREATEST)
     return Field(strict=True, allow_inf_nan=False, gt=gt, ge=least, le=le, json_schema_extra={"unit": unit})
 
 
 def count(least: int, most: int) -> Any:
-    """Describe a field with an integer from ``least`` to ``most``."""
     return Field(strict=True, ge=least, le=most)
 
 
 def components(*names: str) -> Any:
-    """Describe a field with a list of numbers, one for each named component, such as red, green and blue."""
     extra: Any = {"components": list(names)}
     return Field(min_length=len(names), max_length=len(names), fail_fast=True, json_schema_extra=extra)
 
@@ -83,7 +80,6 @@ class OrWord:
     """Marks a field that contains a number or a special word such as "auto"."""
 
     number: Any
-    """Description of the number, from `quantity`."""
     word: str
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -101,8 +97,7 @@ class OrWord:
 Item = TypeVar("Item")
 PER_AXIS, PER_ROTATION = "per axis", "per rotation"
 Vector = Annotated[tuple[Item, ...], PER_AXIS, Field(min_length=2, max_length=3, fail_fast=True)]
-"""A vector with one component for each axis. In 2-D the default value is the first two components of the default in
-3-D."""
+"""In 2-D the default is the first two components of the default in 3-D."""
 Several = Annotated[tuple[Item, ...], Field(min_length=1, fail_fast=True)]
 Text = Annotated[str, Field(strict=True, pattern=r"\S")]
 Flag = Annotated[bool, Field(strict=True)]
@@ -111,7 +106,6 @@ Colour = Annotated[tuple[Annotated[float, quantity(ge=0.0, le=1.0)], ...], compo
 
 
 def without_numpy(value: Any) -> Any:
-    """Convert NumPy arrays and numbers to Python lists and numbers."""
     if isinstance(value, (list, tuple)):
         return [entry.tolist() if isinstance(entry, (np.ndarray, np.generic)) else entry for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
@@ -145,8 +139,7 @@ Inertia = Annotated[tuple[Annotated[float, quantity("kg m2")], ...], _few(9), Be
 
 
 def field_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstrings of fields by name, including fields of base classes. The result is empty if the source code
-    is not available."""
+    """Return the docstrings of fields, with base classes, by name; empty if the source code is missing."""
     found: dict[str, str] = {}
     for one in reversed(cls.__mro__):
         found |= _of_module(one.__module__).get(one.__qualname__, {})
@@ -254,7 +247,6 @@ def _fields(whole: Schema, part: Schema, path: FieldPath) -> Iterator[FieldPath]
 
 
 def _schema_at(whole: Schema, location: FieldPath) -> tuple[Schema, list[str | int]]:
-    """Return the JSON schema of a field and the path of the field, given a location in a pydantic error."""
     part, path = whole, list[str | int]()
     for step in location:
         if "discriminator" in part:
@@ -360,8 +352,6 @@ class Table(BaseModel, metaclass=Documented):
         return placed
 
     def check_components(self, names: Iterable[str], dimension: int, path: FieldPath) -> None:
-        """Raise a `field_error` if a vector does not have ``dimension`` components. ``names`` are the fields with
-        vectors."""
         for name in names:
             value = getattr(self, name, None)
             if value is not None and len(value) != dimension:
