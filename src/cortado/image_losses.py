@@ -129,8 +129,7 @@ def reduce(image: Image) -> Image:
 
 
 def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
-    """Return the adjoint of an image (rows, columns), given the adjoint of the next coarser level. The function is the
-    transpose of `reduce`."""
+    """Return the transpose of `reduce` applied to ``bar``, an image of size ``shape`` = (rows, columns)."""
     rows, columns = shape
     return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
 

@@ -1,5 +1,4 @@
-"""Certificates say whether gradients are right, up to which step they are useful, and which estimator suits longer
-runs."""
+"""Certificates say whether gradients are right, and for how many steps gradients are useful."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,8 +39,7 @@ from cortado.simulation import Simulation
 
 Random = np.random.Generator
 BESIDE = 0.1 * PERTURBATION
-"""Size of small random changes of the initial state. Positions change relative to the spacing, and velocities relative
-to the speed of a fall over the fluid's height."""
+"""Size of small random changes of the initial state, in the units of `PERTURBATION`."""
 ROUGHLY = 0.1
 """Greatest accepted relative difference between the adjoint and the finite differences of a float32 loss."""
 
@@ -83,7 +81,6 @@ class Certificate:
         return f"Certificate({size}, {verdict}, use gradients.{self.estimator})"
 
     def __str__(self) -> str:
-        """Return the certificate as tables and sentences."""
         size = f"{counted(self.particles, 'particle')}, {counted(self.steps, 'step')}, float64"
         tried, changes, spread = {one.parameter for one in self.horizons if one.lasts}, [], ""
         for name, share in self.loss_changes.items():
@@ -267,8 +264,7 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
 def _consistency(
     history: LossHistory, values: Arrays, gradient: Arrays, along: Arrays
 ) -> tuple[Consistency, tuple[str, ...]]:
-    """Check all parameters together, and each parameter alone if this check fails. Return the check of all parameters,
-    and the names of the parameters with a wrong derivative."""
+    """Return the check of all parameters together, and the names of the parameters with a wrong derivative."""
     together = check_consistency(history, values, gradient, along)
     if together.right:
         return together, tuple(along) if history.rough_miss(values, along) > ROUGHLY else ()
@@ -277,11 +273,9 @@ def _consistency(
 
 
 def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> tuple[Consistency | None, int]:
-    """Check the derivatives after small random changes of the initial positions and velocities. Also return the number
-    of checked steps.
+    """Check the derivatives at a randomly changed initial state. Also return the number of checked steps.
 
-    In fluid at rest the loss may have a corner, because terms such as |v| have a corner at velocity v = 0. The adjoint
-    is then a one-sided derivative.
+    The loss of fluid at rest may have a corner, as |v| has at v = 0. The adjoint there is a one-sided derivative.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}
@@ -302,8 +296,6 @@ WIDTH = 110
 
 
 def consistency_words(c: Consistency, beside: Consistency | None = None) -> str:
-    """Describe how many digits of reverse mode, forward mode and central differences agree, and whether the loss has a
-    corner."""
     digits = f"reverse and forward mode agree to {_digits(c.disagreement)} digits"
     if c.miss is None:
         return f"{digits}, no difference is reliable here"

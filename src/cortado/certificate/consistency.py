@@ -1,5 +1,4 @@
-"""Compare directional derivatives of the loss by reverse mode, forward mode and finite differences, in float64 and for
-growing numbers of steps."""
+"""Compare derivatives of the loss by reverse mode, forward mode and finite differences, in float64."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,8 +22,7 @@ from cortado.simulation import Simulation
 
 
 def up_to(problem: Problem, steps: int) -> Problem | None:
-    """Shorten a problem to its first ``steps`` steps. Returns None if no step, or no frame of a `Frames` loss,
-    remains."""
+    """Shorten a problem. Return None if no step, or no frame of a `Frames` loss, remains."""
     loss: Any = problem.loss
     if isinstance(loss, Frames):
         kept = {step: one for step, one in loss.losses.items() if step <= steps}
@@ -44,7 +42,7 @@ ANY_PRECISION = (FinalPositions, CentreOfMass, CentreOfMassAlong, SensorMatch)
 
 
 def in_float64(problem: Problem) -> Problem:
-    """Return the problem in float64. A user-defined loss is wrapped in `Rounded`, because it may need float32."""
+    """Return the problem in float64. A user-defined loss may need float32 and is wrapped in `Rounded`."""
     single = problem.simulation
     if single.precision == FLOAT64:
         return problem
@@ -103,15 +101,13 @@ class LossHistory:
         spread = range(steps + 1) if every else np.linspace(0, steps, SAMPLE_STEPS + 1).round().astype(int)
         self.problem = problem
         self.sample_steps = np.array(sorted(frames) if frames else list(spread)[min(1, steps) :])
-        """Numbers of steps (sample_steps,) after which the loss is computed."""
         by_step = {int(m): frames[m] if frames else loss for m in self.sample_steps}
         self._losses = {m: one if isinstance(one, Rounded) else as_loss(one) for m, one in by_step.items()}
         self._total = np.cumsum if frames else np.asarray
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the central differences of the loss (sample_steps,) with step size ``h``. Also return the distances
-        (sample_steps,) between the forward and the backward difference. Central differences are NaN after a run
-        diverges. The distances are 0 for float32 losses."""
+        """Return central differences of the loss, and distances between one-sided differences, both (sample_steps,).
+        Central differences are NaN after a run diverges. The distances are 0 for float32 losses."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -123,8 +119,7 @@ class LossHistory:
         return self._total(differences + unknown) / (2.0 * h), np.nan_to_num(bends)
 
     def rough_miss(self, parameters: Arrays, along: Arrays) -> float:
-        """Return the relative difference between the adjoints and the finite differences of a float32 loss. The result
-        is the median over the sample steps, with the best step size at each sample step."""
+        """Return the median relative difference between adjoints and finite differences of a float32 loss."""
         if not any(isinstance(loss, Rounded) for loss in self._losses.values()):
             return 0.0
         found = np.full((len(ROUGH), len(self.sample_steps)), np.inf)
@@ -138,8 +133,7 @@ class LossHistory:
         return float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else 0.0
 
     def _beside(self, parameters: Arrays, along: Arrays, h: float) -> Iterator[tuple[Loss, Snapshot, Snapshot]]:
-        """Run twice, with the parameters moved by ``-h`` and by ``h`` times a direction. Yield each loss with the
-        states of both runs, until a run diverges."""
+        """Yield each loss with its states in two runs, at ``-h`` and ``h`` times ``along``, until a run diverges."""
         moved = ({name: parameters[name] + step * d for name, d in along.items()} for step in (-h, h))
         behind, ahead = (self._reached({**parameters, **one}) for one in moved)
         for step, loss in self._losses.items():
@@ -147,8 +141,7 @@ class LossHistory:
                 yield loss, behind[step], ahead[step]
 
     def _reached(self, parameters: Arrays) -> dict[int, Snapshot]:
-        """Return the states at the sample steps before a particle is lost. No states are returned if the run cannot
-        begin."""
+        """Return the states at the sample steps before a particle is lost, or none if the run cannot begin."""
         try:
             return self.problem.states(parameters, self._losses)
         except NO_RUN as error:
@@ -185,8 +178,7 @@ class LossHistory:
 
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
-    """Return the change of a loss between two states, to second order. The change is computed from the mean of the
-    adjoints at both states, which avoids round-off."""
+    """Return the change of a loss to second order, from the mean of both adjoints, which avoids round-off."""
     ends = (before, after)
     old, new = (end.state.numpy(end.dimension) for end in ends)
     distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
@@ -197,7 +189,7 @@ def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
 
 
 STEPS = tuple(10.0**-k for k in range(3, 9))
-"""Step sizes of the central differences, as multiples of the direction, in the order of use."""
+"""Step sizes of the central differences, as multiples of the direction."""
 MODE_TOLERANCE = 1e-8
 """Greatest accepted relative difference between reverse and forward mode in float64."""
 PLATEAU = 1e-3
@@ -205,8 +197,7 @@ PLATEAU = 1e-3
 CORNER = 1e-4
 """Least relative difference between the two one-sided slopes at a corner of the loss."""
 SLACK = 10.0
-"""Greatest accepted distance between forward mode and a central difference, relative to the distance between two
-successive central differences."""
+"""Greatest accepted distance from forward mode to a central difference, relative to `Consistency.gaps`."""
 RESOLUTION = 1e-6
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 FAINT = 1e-4
@@ -232,8 +223,7 @@ class Consistency(ShortRepr):
     tangents: np.ndarray
     """Directional derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps) for each tried step size. Empty if reverse and forward mode
-    disagree."""
+    """Central differences (tried, sample_steps). Empty if reverse and forward mode disagree."""
     sides: np.ndarray
     """Distances (tried, sample_steps) between the forward and the backward difference, for each tried step size."""
     steps: np.ndarray
@@ -249,27 +239,23 @@ class Consistency(ShortRepr):
 
     @property
     def gaps(self) -> np.ndarray:
-        """Relative differences (tried - 1, sample_steps) between central differences with successive step sizes.
-        Round-off is added to the differences. Each value is the maximum over the sample steps up to its own."""
+        """Relative differences (tried - 1, sample_steps) of central differences with successive step sizes."""
         round_off = DIFFERENCE_ROUND_OFF * np.abs(self.losses).max() / self.steps[1:, None]
         return self._worst(np.abs(np.diff(self.differences, axis=0)) + round_off)
 
     @property
     def misses(self) -> np.ndarray:
-        """Relative distances (tried, sample_steps) between central differences and forward mode. Each value is the
-        maximum over the sample steps up to its own."""
+        """Relative distances (tried, sample_steps) between central differences and forward mode."""
         return self._worst(np.abs(self.differences - self.tangents))
 
     @property
     def corner(self) -> np.ndarray:
-        """Relative distance (sample_steps,) between the forward and the backward difference, least over all step sizes.
-        The distance is about 0 if the loss has no corner."""
+        """Relative distance (sample_steps,) between the one-sided differences, about 0 without a corner."""
         return np.asarray(self._worst(self.sides).min(axis=0, initial=np.inf))
 
     @property
     def is_on_a_corner(self) -> bool:
-        """True if the loss has a corner. Reverse and forward mode then agree, but the forward and the backward
-        difference have different limits."""
+        """True if reverse and forward mode agree, but the two one-sided differences do not."""
         slopes = self.corner[self.converged]
         return self.disagreement < MODE_TOLERANCE and bool(len(slopes)) and float(slopes[-1]) > CORNER
 
@@ -285,17 +271,12 @@ class Consistency(ShortRepr):
 
     @property
     def miss(self) -> float | None:
-        """Relative distance between forward mode and the nearest central difference, at the last converged sample step.
-        None if the central differences converge at no sample step."""
+        """Relative distance from forward mode to the nearest central difference at `last_converged`, or None."""
         return float(self.misses[:, self.converged].min(axis=0)[-1]) if self.converged.any() else None
 
     @property
     def differences_agree(self) -> bool:
-        """True if forward mode agrees with the central differences wherever the central differences converge.
-
-        The allowed distance is `SLACK` times the least distance between two successive central differences. At a corner
-        of the loss, the allowed distance is the distance between the forward and the backward difference.
-        """
+        """True if forward mode agrees with the central differences wherever the central differences converge."""
         allowed = np.maximum(SLACK * self.gaps.min(axis=0, initial=np.inf), RESOLUTION)
         near = self.misses.min(axis=0, initial=np.inf) <= np.maximum(allowed, self.corner)
         return bool(near[self.converged].all())
@@ -306,6 +287,7 @@ class Consistency(ShortRepr):
         return self.disagreement < MODE_TOLERANCE and self.differences_agree
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
+        """Divide by the size of the differences. Both are the greatest numbers up to each sample step."""
         size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
         worst = np.maximum.accumulate(distances, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -327,7 +309,7 @@ def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
 
 
 def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, directions: Arrays) -> Consistency:
-    """Compare directional derivatives along `balanced` directions. ``gradient`` is the gradient by reverse mode."""
+    """Compare derivatives along `balanced` directions. ``gradient`` is the gradient by reverse mode."""
     along = balanced(gradient, directions)
     losses, tangents, _ = history.tangent(values, along)
     products = np.concatenate([(gradient[name] * along[name]).ravel() for name in along])

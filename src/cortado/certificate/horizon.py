@@ -22,7 +22,6 @@ spacing, and velocities relative to the speed of a fall over the fluid's height.
 
 
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
-    """Return the values of the requested parameters. ``parameters`` has values by name, or only names."""
     simulation = problem.simulation
     if problem.state is not None:
         said = "problem begins at a state, but must begin as its scene does"
@@ -51,8 +50,7 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
 
 
 def everything(problem: Problem, chosen: Arrays) -> Arrays:
-    """Return the values of all parameters that affect the run and can be both increased and decreased. Values that are
-    not in ``chosen`` come from the scene. Parameters that vary over time have a value for each step."""
+    """Return the values of all parameters that affect the run and can be both increased and decreased."""
     values = {**ParameterSpace(problem.simulation, problem.steps).defaults(), **chosen}
     found = {}
     for name, value in values.items():
@@ -71,8 +69,7 @@ def _moves_both_ways(parameter: Parameter, value: np.ndarray) -> bool:
 
 
 def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION) -> Arrays:
-    """Return the size of a meaningful perturbation of each parameter, in the parameter's shape and unit. The size is
-    proportional to the parameter's value, to the spacing for positions, or to the speed of a fall for velocities."""
+    """Return the size of a meaningful perturbation of each parameter, in the shape and unit of the parameter."""
     known = problem.simulation.known
     sizes = {name: perturbation * known[name].change(problem.simulation, value) for name, value in values.items()}
     return {name: np.broadcast_to(size, values[name].shape) for name, size in sizes.items()}
@@ -85,8 +82,7 @@ def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Ar
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions that are smooth in space and constant in time. The direction of a displacement over time
-    grows from 0."""
+    """Return random directions, smooth in space and constant in time. Displacements over time grow from 0."""
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
@@ -105,8 +101,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 
 def growth(norms: np.ndarray, time_step: float) -> float:
-    """Return the growth of an adjoint from the last state back to the first [e-folds]. The growth is found from a line
-    fitted to the logarithms of ``norms``."""
+    """Return the growth of an adjoint over all backward steps [e-folds], by a line fit to log ``norms``."""
     steps = len(norms) - 1
     total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
     there = np.flatnonzero(total > 0.0)
@@ -144,8 +139,7 @@ class Horizon(ShortRepr):
 
     @property
     def measured(self) -> int:
-        """Last sample step at which the exact derivative is useful. The derivative must also be useful at the previous
-        sample step. The result is 0 without such a step."""
+        """Last of two successive sample steps at which the exact derivative is useful, or 0."""
         good = self.meaningful
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
@@ -192,8 +186,6 @@ AVERAGES: dict[str, Callable[[dict[str, float]], GradientEstimator]] = {
 
 @dataclass(frozen=True)
 class Judged:
-    """The gradient of an estimator compared with the smoothed gradient."""
-
     estimator: str
     """Python code of the estimator, without the prefix ``gradients.``."""
     cosine: float
@@ -202,8 +194,7 @@ class Judged:
 
     @property
     def merit(self) -> float:
-        """Cosine between the estimator's gradient and the smoothed gradient, multiplied by the ratio of the smaller
-        norm to the larger norm. A perfect gradient has the merit 1."""
+        """Cosine times the ratio of the smaller norm to the larger norm. A perfect gradient has the merit 1."""
         return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
 
 
@@ -213,7 +204,7 @@ class Alignment:
     """Relative standard error of the smoothed gradient."""
     estimators: tuple[Judged, ...]
     spread: Mapping[str, float] = field(default_factory=dict)
-    """Size of the random changes in the smoothed gradient and in ensemble averages, by parameter name."""
+    """Standard deviation of the random changes in ensembles, by parameter name."""
 
     @property
     def best(self) -> Judged | None:
@@ -223,8 +214,7 @@ class Alignment:
 
 
 def alignment(problem: Problem, values: Arrays, sizes: Arrays, exact: Arrays) -> Alignment | None:
-    """Compare the gradients of estimators with the smoothed gradient, for all parameters together. Returns None if the
-    parameters have too many components, if a run fails, or if the loss does not depend on the parameters."""
+    """Return None if the parameters have too many components, a run fails, or the smoothed gradient is 0."""
     if sum(value.size for value in values.values()) > MOST_NUMBERS:
         return None
     spread = {name: float(size.mean()) for name, size in sizes.items()}

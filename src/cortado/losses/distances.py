@@ -25,7 +25,6 @@ from cortado.scene.motions import AXES, Pose, matrix, position_name, solids_in
 
 @cache
 def matching_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels: ``squared_distance``, in float64, and ``difference``, which also multiplies by a factor."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"matching_{precision.name}")
     typed = TypesByName(real, {vector: "x target bar", wp.float64: "squares"})
@@ -159,7 +158,7 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _shares(weights: np.ndarray | None, end: Snapshot, name: str, vector: np.ndarray) -> np.ndarray:
-    """Return the masses divided by their sum (n,). Raises `InputError` if the vector does not suit the scene."""
+    """Return the masses divided by their sum (n,)."""
     n = len(end.positions)
     if vector.shape != (end.dimension,):
         raise InputError(f"{name} has shape {vector.shape}, but must be {(end.dimension,)}.")
@@ -229,8 +228,7 @@ class Pictures(Protocol):
         """Return the picture (rows, columns, 3) of particles."""
 
     def adjoint(self, image_bar: np.ndarray) -> Any:
-        """Return the derivatives with respect to ``positions``, ``fractions`` and ``colours``, given the derivative
-        with respect to the last picture."""
+        """Return the derivatives ``positions``, ``fractions`` and ``colours`` of the picture that was rendered last."""
 
 
 @fixed

@@ -32,7 +32,6 @@ class OnHost:
 
     @property
     def precision(self) -> Precision:
-        """The precision of the Warp arrays."""
         return precision_of(self.state)
 
     @cached_property
@@ -64,8 +63,7 @@ class Snapshot(OnHost):
     colours: np.ndarray
     """Colours of the phases (phases, 3) in linear RGB from 0 to 1."""
     moment: Moment | None = None
-    """State and parameters of the next step, from which particle quantities are computed. The value is None if they are
-    unknown."""
+    """State and parameters of the next step, or None. Particle quantities are computed from these."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"
@@ -110,8 +108,6 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
-    """Return the state and parameters from which particle quantities are computed. Raises `InputError` if they are
-    unknown."""
     if end.moment is None:
         raise InputError("The state has no simulation, with which quantities are computed: take a state of a run.")
     return end.moment
@@ -161,7 +157,7 @@ mass fractions (n, phases); a `State` of Warp arrays; or a table by state field 
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """Convert derivatives of a loss to a table of arrays by state field and quantity. Vectors have the shape (n, d)."""
+    """Return derivatives by name of a state field or quantity. Vectors have the shape (n, d)."""
     if isinstance(bar, Mapping):
         return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
@@ -170,7 +166,6 @@ def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
 
 
 def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
-    """Convert derivatives of a loss to Warp arrays for fields and to a table for quantities."""
     if isinstance(bar, SnapshotAdjoint):
         return bar
     no_colours = np.zeros_like(end.colours)
@@ -183,8 +178,7 @@ def bar_on_device(bar: Adjoint, end: Snapshot) -> SnapshotAdjoint:
 
 
 def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...] = ()) -> np.ndarray:
-    """Return the derivative of a loss along tangents of fields, quantities and colours. ``bar`` has the derivatives of
-    the loss. The result has the shape ``leading``, which is (batch,) for a batch. Missing names count as 0."""
+    """Return the derivative (``leading``) of a loss along the tangents ``dots``. A missing tangent counts as 0."""
     arrays = by_field(bar, np.shape(dots["positions"])[-1])
     arrays |= {"colours": bar.colours} if isinstance(bar, SnapshotAdjoint) else {}
     pairs = [(array.astype(np.float64), np.asarray(dots[n], np.float64)) for n, array in arrays.items() if n in dots]
@@ -286,8 +280,6 @@ class SnapshotBatch(OnHost, Sequence[Snapshot]):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class _Member(Snapshot):
-    """A snapshot of one scene of a batch. On first use, the arrays of all scenes are copied together."""
-
     batch: SnapshotBatch
     number: int
 

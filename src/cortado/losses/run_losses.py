@@ -69,9 +69,6 @@ FORMS = "positions", "velocities", "mass fractions"
 
 
 class CheckedLoss:
-    """A loss with checked values and derivatives. The loss's method ``adjoint`` is called if it exists, or else
-    ``value_and_adjoint``."""
-
     def __init__(self, loss: Any):
         self._loss = loss
 
@@ -79,7 +76,6 @@ class CheckedLoss:
         return as_one_number("the loss's value", self._loss.value(end))
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        """Return the checked loss and its derivatives. NumPy arrays are float64."""
         if hasattr(self._loss, "adjoint"):
             return self.value(end), self._checked(self._loss.adjoint(end), end)
         value, bar = self._loss.value_and_adjoint(end)
@@ -90,8 +86,7 @@ class CheckedLoss:
         return _among(members, [self.value(end[b]) for b in members], len(end))
 
     def values_and_adjoints(self, end: SnapshotBatch, members: Sequence[int]) -> tuple[np.ndarray, SnapshotAdjoint]:
-        """Return the `values` and the derivatives with respect to the states. The derivatives are 0 for scenes outside
-        ``members``."""
+        """Return the `values` and their derivatives, which are 0 for scenes outside ``members``."""
         found, state, colours = np.full(len(end), np.nan), end.state.like(), np.zeros_like(end.colours)
         quantities: dict[str, np.ndarray] = {}
         for b in members:
@@ -154,7 +149,6 @@ def _among(members: Sequence[int], values: Any, batch: int) -> np.ndarray:
 
 
 def as_loss(loss: Any) -> CheckedLoss:
-    """Wrap a loss or a function of Warp arrays, with checked results. Raises `InputError` for any other object."""
     if isinstance(loss, type):
         raise InputError(f"loss is the class {loss.__name__}, but must be an object of this class.")
     derivative = next((name for name in ("adjoint", "value_and_adjoint") if hasattr(loss, name)), None)
@@ -208,11 +202,8 @@ def _layout(array: wp.array) -> str:
 
 
 class LossesByStep(dict[int, CheckedLoss]):
-    """The losses of a run by number of steps."""
-
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
-        """Take a ``loss`` of the last state, or a `Frames` loss. Raises `InputError` for any other object, and for
-        frames beyond ``steps``. If the run chooses its time steps, frames at fixed times are errors too."""
+        """``loss`` reads the last state, or is a `Frames`. ``chosen`` is true if the run chooses its time steps."""
         if chosen and getattr(loss, "time_step", None) is not None:
             wanted = 'one of numbers of steps, as solver.time_step is "auto"'
             raise InputError(f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be {wanted}.")
@@ -235,8 +226,7 @@ class LossesByStep(dict[int, CheckedLoss]):
         return {step: one.quantity for step, one in sums.items() if one.quantity is not None}
 
     def total(self, ends: Mapping[int, Any], going: Sequence[int] | None) -> Any:
-        """Return the sum of the losses of the states ``ends``, which are given by number of steps. For a batch the
-        result is an array (batch,), with NaN for scenes outside ``going``."""
+        """Return the sum of all losses. The sum for a batch has the shape (batch,), with NaN outside ``going``."""
         self._check(ends)
         each = ((ends[step], loss) for step, loss in self.items())
         return sum(loss.value(end) if going is None else loss.values(end, going) for end, loss in each)
@@ -244,7 +234,6 @@ class LossesByStep(dict[int, CheckedLoss]):
     def total_and_adjoints(
         self, ends: Mapping[int, Any], going: Sequence[int] | None
     ) -> tuple[Any, dict[int, SnapshotAdjoint]]:
-        """Return the `total` of the losses and the derivatives with respect to the states, by number of steps."""
         self._check(ends)
         total: Any = 0.0
         bars = dict[int, SnapshotAdjoint]()

@@ -1,5 +1,4 @@
-"""The files of a data set. While runs are computed, each run has its own file. At the end there are three files with
-the runs for training, validation and tests, and a file with the metadata."""
+"""The files of a data set: one file for each run at first, and three assembled files with metadata at the end."""
 
 import io
 import json
@@ -38,7 +37,7 @@ class DatasetFolder:
         self.out, self.parts = out, out / PARTS
 
     def save(self, number: int, run: OneRun) -> None:
-        """Write a run to a new file atomically. HDF5 writes to memory first, because HDF5 may crash on a full disk."""
+        """HDF5 may crash on a full disk. The run is therefore first written to memory."""
         import h5py
 
         content = io.BytesIO()
@@ -69,7 +68,7 @@ class DatasetFolder:
 
     @property
     def runs(self) -> dict[int, FinishedRun]:
-        """Return the finished runs by number, from assembled files and from files of single runs."""
+        """Return the finished runs by number."""
         return self._read[0]
 
     @property
@@ -105,8 +104,7 @@ class DatasetFolder:
         return max([int(self.metadata.get("runs", 0)), *(number + 1 for number in numbers)])
 
     def assemble(self, split: Mapping[str, Sequence[int]]) -> None:
-        """Write the files whose runs differ from ``split``. If writing fails, no file is changed, and
-        `ComputationError` is raised."""
+        """Write the files whose runs differ from ``split``. If writing fails, no file is changed."""
         stale = {}
         for purpose, numbers in split.items():
             path = self.path(purpose)
@@ -153,8 +151,7 @@ class DatasetFolder:
 def metadata(
     scene: Scene, table: DatasetTable, split: Mapping[str, Sequence[int]], folder: DatasetFolder, runs: int
 ) -> dict[str, Any]:
-    """Return the metadata of a data set for LagrangeBench. ``split`` has the numbers of the runs for training,
-    validation and tests."""
+    """Return the metadata of a data set in the format of LagrangeBench."""
     frames, (origin, size, periods) = table.steps // table.write_every + 1, bounds_of(scene)
     every = [folder.runs[number].statistics for own in split.values() for number in own]
     train = [folder.runs[number].statistics for number in split["train"]]

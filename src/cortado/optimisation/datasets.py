@@ -97,8 +97,7 @@ class DatasetTable(Table):
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return the numbers of the runs for training, validation and tests. Additional runs do not change the use of
-        earlier runs."""
+        """Return the numbers of the runs for each purpose. Additional runs do not change the use of earlier runs."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
@@ -146,8 +145,7 @@ class Sample:
         return found
 
     def direction(self, which: int, shape: tuple[int, ...], sizes: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Return a random direction for derivatives with respect to the initial positions and velocities, by name.
-        ``sizes`` are the standard deviations [m, m/s]."""
+        """Return a random direction by name. ``sizes`` are the standard deviations [m, m/s]."""
         random = self._random(2, which)
         return {name: size * random.standard_normal(shape) for name, size in zip(FIRST, sizes, strict=True)}
 
@@ -160,20 +158,18 @@ FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
 """Particle types of LagrangeBench. ``MORE_FLUID`` is the type of further phases, and ``KINDS`` is the number
 of types."""
 MARGIN = 3
-"""Distance from the container to the bounds of the data set [spacings]. The distance separates opposite walls, because
-LagrangeBench treats all axes as periodic if one axis is periodic."""
+"""Distance from the container to the bounds of the data set [spacings]. LagrangeBench treats all axes as periodic if
+one axis is periodic. Opposite walls must therefore be far apart."""
 
 
 @dataclass(frozen=True)
 class OneRun:
     arrays: dict[str, np.ndarray]
     statistics: dict[str, Any]
-    """Statistics of the run: count, sum and sum of squares of fluid velocities and accelerations [m per frame], the
-    greatest coordinates [m], and the number of particles."""
+    """Counts, sums and sums of squares of first and second differences of positions [m], for `metadata`."""
 
 
 def one_run(simulation: Simulation, sample: Sample) -> OneRun:
-    """Run and differentiate a simulation from the initial state of a sample. Raises `DivergedError` or `InputError`."""
     table, scene = sample.table, simulation.scene
     start = sample.start(simulation.positions, simulation.velocities, scene.discretisation.spacing)
     trajectory = simulation.run(table.steps, start, record_every=table.write_every)
@@ -198,11 +194,7 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lower corner, the lengths and the periods of the bounds of a data set, each (d,) [m]. The period of a
-    non-periodic axis is 0.
-
-    Raises `InputError` without a container, or if particles wait far outside the container.
-    """
+    """Return lower corner, lengths and periods of the bounds, each (d,) [m]. An axis without a period has 0."""
     ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
         raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
@@ -232,8 +224,7 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
 
 
 def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics of first and second differences of positions (frames, n, d), and the greatest coordinates (d,)
-    [m]. Raises `InputError` if a position is below the bounds."""
+    """Return statistics of differences of positions (frames, n, d), and the greatest coordinates (d,) [m]."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         found = f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis}"

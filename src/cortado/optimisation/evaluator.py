@@ -71,16 +71,15 @@ class Record:
 
 @dataclass
 class Promises:
-    """A test of a search's gradients, which compares predicted and real changes of the loss between evaluations.
+    """Predicted and real changes of the loss in each step of a search, to test the gradients.
 
-    The slopes at the two ends of a step give two predictions. If the loss is smooth, its real change is close to a
-    prediction or between the two. Steps with a change of sign of the slope are not tested, because they may cross a
-    minimum.
+    The slopes at the two ends of a step give two predictions. The change of a smooth loss is close to a prediction or
+    between the two. A step may cross a minimum if the slope changes its sign. Such a step is not tested.
     """
 
     losses: list[float] = field(default_factory=list)
     steps: list[tuple[float, float, float]] = field(default_factory=list, repr=False)
-    """Three changes of the loss for each step: predicted at the start, predicted at the end, and real."""
+    """Changes of the loss in each step: predicted at the start, predicted at the end, and real."""
     _last: LoggedEvaluation | None = field(default=None, repr=False)
     _best: LoggedEvaluation | None = field(default=None, repr=False)
 
@@ -98,9 +97,7 @@ class Promises:
     def doubt(
         self, search: Search, estimator: object, optimiser: object, converged: bool, is_run: bool
     ) -> tuple[bool, bool, str]:
-        """Return whether a search was misled, and whether its loss stopped falling although no parameter is at a bound.
-        The third result is a text with advice. ``estimator`` is None for the problem's own gradient. ``is_run`` is True
-        for a loss of a simulation."""
+        """Return whether the gradients misled the search, whether its loss stopped falling, and advice."""
         assert self._best is not None
         x, gradient = self._best.parameters, self._best.gradient
         outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
@@ -141,8 +138,7 @@ class Promises:
 
 @dataclass
 class Evaluator:
-    """The objective function of the optimiser. The evaluator first replays logged evaluations, and then computes and
-    logs new ones."""
+    """The objective function of the optimiser. Logged evaluations are replayed first."""
 
     problem: Optimisable
     estimator: Any
@@ -157,11 +153,9 @@ class Evaluator:
     logged: int = 0
 
     left_out: int = 0
-    """Number of failed runs that ensemble averages ignored."""
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Return the estimate of an ensemble, and count the runs missing from its average. Only the first such estimate
-        gives a warning."""
+        """Estimate with an ensemble. Only the first estimate with failed runs gives a warning."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -180,11 +174,10 @@ class Evaluator:
         return found
 
     def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
-        """Return the loss and its gradient at a vector. For a failed run, return None and log an infinite loss."""
+        """Return the loss and its gradient. For a failed run, return None and log an infinite loss."""
         return self._next(vector, is_trial=True)
 
     def _next(self, vector: Vector, is_trial: bool) -> tuple[float, Vector] | None:
-        """Replay or compute the next evaluation. Evaluations with a finite loss are added to the history."""
         replayed = self.logged < len(self.log)
         if replayed:
             evaluation = self._replay(vector)
@@ -219,8 +212,7 @@ class Evaluator:
         return evaluation.loss, evaluation.gradient.copy()
 
     def losses(self, vectors: Sequence[Vector]) -> list[float]:
-        """Return the losses at several vectors (size,). The loss is infinite if a run diverges or parameters are out of
-        range. The losses are logged without a gradient and are not part of the history."""
+        """Return the losses at vectors (size,), infinite for failed runs. The history does not contain the losses."""
         known = [self._replay(vector, k).loss for k, vector in enumerate(vectors[: len(self.log) - self.logged])]
         left = vectors[len(known) :]
         found: list[float] = []
@@ -251,8 +243,7 @@ class Evaluator:
         raise InputError(f"{said}, and its gradient, a dictionary with an array for each parameter by its name.")
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the logged evaluation ``ahead`` positions after the next one. Raises `InputError` if the logged vector
-        differs."""
+        """Return the logged evaluation ``ahead`` positions after the next one."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
@@ -276,7 +267,6 @@ class Evaluator:
         return error.with_advice("; ".join([*told, least]))
 
     def _computed(self, vector: Vector) -> LoggedEvaluation:
-        """Evaluate the problem. Raises an error for wrong names or shapes, or values that are not finite."""
         loss, gradients = self._evaluated(self.layout.unravel(vector))
         loss = as_one_number("The problem's loss", loss)
         wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))

@@ -46,14 +46,12 @@ class Function:
         return str(getattr(self.function, "__qualname__", type(self.function).__qualname__))
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
-        """Return the result of the function. Raises `InputError` if a gradient estimator is given."""
         if gradient is not None:
             raise InputError("gradient is given, but must be left out, as a function returns its gradient.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
-    """Return a problem unchanged, or make a problem of a function. Raises `InputError` for any other object."""
     if isinstance(problem, type):
         raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object of this class.")
     if hasattr(problem, "value_and_gradient"):
@@ -113,7 +111,6 @@ class Result:
 
 
 def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
-    """Return the start as float64 arrays. Raises `InputError` for values that are not finite numbers."""
     if not isinstance(start, Mapping):
         raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
@@ -128,8 +125,7 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 
 
 def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, Vector]]:
-    """Return lower and upper bounds by name. Missing bounds are infinite. Raises `InputError` for bounds that do not
-    match the parameters."""
+    """Return lower and upper bounds by name, in the shapes of the parameters. Missing bounds are infinite."""
     if not isinstance(bounds, Mapping):
         raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
     if unknown := sorted(set(bounds) - set(start), key=str):

@@ -41,22 +41,18 @@ def require_fraction(name: str, value: float) -> None:
 
 
 def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
-    """Raise `InputError` if ``values`` has a name that is not a parameter."""
     if isinstance(values, Mapping) and set(values) != set(layout.names):
         said = f"{name} is given for {quoted(values)}, but the optimised parameters are {quoted(layout.names)}"
         raise InputError(f"{said}; give it for each of these, or one number for all.")
 
 
 class Iterate:
-    """The current point of an optimiser."""
-
     def __init__(self, search: Search):
         self._search, self.x = search, search.start
         self.loss, self.gradient = search.evaluate(search.start)
 
     def move(self, target: Vector) -> float:
-        """Move to the point ``target`` (size,). If the run at this point fails, the step is halved until a run
-        succeeds. Return the remaining fraction of the step. If all runs fail, raise the error of the last run."""
+        """Move to ``target`` (size,), or halve the step until a run succeeds. Return the fraction of the step."""
         self._search.updated()
         part, tried = 1.0, target
         found = self._search.attempt(tried)
@@ -68,7 +64,6 @@ class Iterate:
         return part
 
     def outcome(self, name: str) -> Outcome:
-        """Return the outcome of an optimiser that has no convergence test."""
         return Outcome(self.x, False, f"{name} made all its {self._search.iterations} updates.")
 
 
@@ -352,7 +347,6 @@ BY_NAME: dict[str, Any] = {"adam": Adam, "gradient_descent": GradientDescent, "l
 
 
 def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
-    """Make an optimiser from a name and settings, or return an optimiser. Raises `InputError` for other objects."""
     if isinstance(optimiser, str):
         if optimiser not in BY_NAME:
             wanted = f"one of {quoted(BY_NAME)}, or an object"

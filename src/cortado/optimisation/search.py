@@ -65,15 +65,12 @@ class LoggedEvaluation:
 
 
 class MemoryLog(list[LoggedEvaluation]):
-    """A replay log in memory, which is lost when the process ends."""
-
     fate = "were not kept, as there is no checkpoint"
 
     def read(self, index: int) -> LoggedEvaluation:
         return self[index]
 
-    def close(self) -> None:
-        """Do nothing: no file is open."""
+    def close(self) -> None: ...
 
 
 class ReplayLog:
@@ -88,11 +85,7 @@ class ReplayLog:
     def __init__(
         self, folder: str | os.PathLike[str], layout: ParameterLayout, settings: Mapping[str, str], resume: bool
     ):
-        """Open the log in ``folder`` to ``resume`` a search, or begin a new log.
-
-        Raises `InputError` if the folder contains evaluations and ``resume`` is false, if ``settings`` differ from the
-        settings in the log, or if a record before the last one is damaged.
-        """
+        """Open the log in ``folder`` to ``resume`` a search, or begin a new log."""
         path, self._size, self._record_size = Path(folder) / REPLAY_LOG, layout.size, 8 + 8 * (1 + 2 * layout.size) + 4
         self._path, self.fate = path, f"are in '{path}'"
         shapes = [list(shape) for shape in layout.shapes]
@@ -143,8 +136,7 @@ class ReplayLog:
         self._file.close()
 
     def _begun(self, header: Mapping[str, Any]) -> tuple[int, int]:
-        """Return the offset of the first record in the file [bytes], and the number of complete records. Raises
-        `InputError` if the first line differs from ``header``, or if a record before the last one is damaged."""
+        """Return the offset of the first record in the file [bytes], and the number of complete records."""
         try:
             found = parsed_json(self._file.readline(2**20))  # a damaged file may have no line end
         except ValueError:

@@ -58,16 +58,15 @@ class TaskFigures:
 
 @dataclass(frozen=True)
 class KnotValues:
-    """Values of a parameter over time at k knots, with linear interpolation between knots."""
+    """Values of a parameter over time at k knots. The unit is the unit of the parameter."""
 
     times: np.ndarray
     """Times of the knots (k,) [s]."""
     start: np.ndarray
-    """Values at the start of the search, (k, d) or (k,), in the unit of the parameter."""
+    """Values (k, d) or (k,) at the start of the search."""
     estimate: np.ndarray
-    """Found values, (k, d) or (k,), in the unit of the parameter."""
     true: np.ndarray | None
-    """Best approximation of the true parameter, (k, d) or (k,). None if the target is a picture."""
+    """Best approximation of the true parameter (k, d) or (k,). None if the target is a picture."""
 
     def for_machines(self) -> dict[str, np.ndarray]:
         known = {} if self.true is None else {"true": self.true}
@@ -143,7 +142,6 @@ def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
 
 
 def component_names(task: Task, name: str, value: np.ndarray) -> list[str]:
-    """Return names for the components of a parameter: axes, phases, or consecutive numbers."""
     scene, parameter, last = task.scene, task.known[name], np.shape(value)[-1:]
     count = int(np.prod(np.shape(value))) if parameter.axis is not Axis.STEP else int(np.prod(last))
     label = name.replace("_", " ")
@@ -242,7 +240,6 @@ class FitTask:
 
 
 def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> FitTask:
-    """Read a task of `cortado fit` from a TOML file, or raise `SceneError`."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("optimise", "dataset"))
     if "fit" not in data:

@@ -32,9 +32,6 @@ GIVEN = Words("given")
 
 @dataclass(frozen=True)
 class Task:
-    """A scene with a target and a search for the parameters that reach this target. Parameters over time have one value
-    for each time step."""
-
     scene: Scene
     problem: ProblemTable
     optimise: OptimiseTable
@@ -43,11 +40,10 @@ class Task:
     start: dict[str, Any]
     known: Known
     folder: Path = Path()
-    """Folder of the task's file, to which paths in the task are relative."""
+    """Folder to which paths in the task are relative."""
 
 
 def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Task:
-    """Read a task from a TOML file, or raise `SceneError`."""
     file = os.fspath(path)
     data = read_toml(path, overrides, ("fit", "dataset"))
     scene = scene_from_dict(data, file)
@@ -80,8 +76,6 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
 
 
 def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Table]) -> tuple[Known, Any]:
-    """Return the parameters of the scene and the checked tables of a task. Raises `SceneError` if the tables do not
-    match the scene."""
     try:
         known = known_in(scene)
         names = (*offered(scene), *(p.name for p in known.own if p.role is not Role.CLOCK))
@@ -95,7 +89,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Check values by parameter name, and interpolate parameters over time to all time steps. Raises `SceneError`."""
+    """Check values by parameter name, and interpolate values at knots to all time steps."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]
@@ -133,7 +127,6 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 
 
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
-    """Raise `SceneError` for an option that contradicts another option or that has no effect."""
     over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
         raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
@@ -207,7 +200,6 @@ def _in_words(shapes: Sequence[tuple[int, ...]]) -> str:
 
 
 def task_in_words(task: Task) -> list[str]:
-    """Describe a task in three paragraphs: the searched parameters, the target, and the algorithm."""
     problem, settings = task.problem, task.optimise
     seconds = problem.steps * task.scene.solver.time_step
     compared = "images" if problem.loss == "image" else "positions of all particles"
@@ -239,7 +231,7 @@ def _listed(words: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Setup:
-    """The arguments of `cortado.optimise` for a task on a device."""
+    """The arguments of `cortado.optimise` for a task."""
 
     task: Task
     problem: Problem
@@ -266,7 +258,6 @@ class Setup:
 
 
 def setup(task: Task, device: str, precision: str) -> Setup:
-    """Set up a task on a device. Raises `InputError` for a picture that cannot be read."""
     simulation = Simulation(task.scene, device, precision)
     start = {name: _start(name, value, simulation) for name, value in task.start.items()}
     settings, searches = task.optimise, []

@@ -33,8 +33,7 @@ ESTIMATORS: dict[str, AdjointEstimator] = {"exact": Exact(), "adjoint_viscosity"
 
 
 def _arrays(values: Any, info: ValidationInfo, words: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Convert values to arrays by parameter name. Parameters in `CAN_BE_RANDOM` may instead have one of the ``words``
-    as their value."""
+    """Convert values to arrays by parameter name. Parameters in `CAN_BE_RANDOM` may be one of the ``words``."""
     if not isinstance(values, Mapping) or not values:
         raise field_error((), Words("empty") if values == {} else values, wanted(VALUES))
     names, flat = _names(info), dict[str, Any]()
@@ -62,7 +61,6 @@ def _offered(info: ValidationInfo) -> str:
 
 
 def _known(name: Any, check: Callable[[Any], Any], info: ValidationInfo) -> Any:
-    """Check that a scene has the parameter with this name."""
     if info.context and name not in _names(info):
         raise field_error((), name, _offered(info))
     return name if info.context else check(name)
@@ -157,7 +155,6 @@ AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(disc
 
 
 def _growing(value: Any, check: Callable[[Any], Any]) -> tuple[float, ...]:
-    """Return the factors of a continuation schedule. Raises a `field_error` if the factors do not increase to 1."""
     with suppress(ValueError):
         factors = check(value)
         if factors[-1] == 1.0 and all(a < b for a, b in pairwise(factors)):
@@ -282,7 +279,7 @@ class GradientTable(Table):
         return self
 
     def estimator(self, executor: Executor | None = None) -> GradientEstimator:
-        """Make the gradient estimator of the table. ``executor`` computes the samples of an ensemble."""
+        """``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
         if isinstance(one, AdjointViscosity):
             coefficient = one.coefficient if self.coefficient is None else self.coefficient
@@ -332,7 +329,6 @@ class OptimiseTable(Table):
         return self
 
     def algorithm(self) -> Optimiser:
-        """Make the optimiser of the table."""
         setting = "scale" if self.optimiser in ("lbfgs", "line_search") else "learning_rate"
         given = {setting: self.learning_rate, "tolerance": self.tolerance}
         made: Optimiser = BY_NAME[self.optimiser](**{key: one for key, one in given.items() if one is not None})
@@ -340,8 +336,6 @@ class OptimiseTable(Table):
 
 
 class TaskTables(Table):
-    """The tables [problem] and [optimise] of a task."""
-
     problem: ProblemTable
     optimise: OptimiseTable
 
@@ -365,14 +359,12 @@ class FitTable(Table):
 
 
 class FitTables(Table):
-    """The tables [problem] and [fit] of a task with measured data."""
-
     problem: ProblemTable
     fit: FitTable
 
 
 def file_schema() -> dict[str, Any]:
-    """Return the JSON schema of scenes, tasks and data sets: names, types, units and ranges of all keys."""
+    """Return the JSON schema of scenes, tasks and data sets."""
     schemas = [model.model_json_schema() for model in (Scene, TaskTables, FitTables, DatasetTables)]
     tables = {name: table for schema in schemas for name, table in schema["$defs"].items()}
     for table in tables.values():

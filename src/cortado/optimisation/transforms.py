@@ -120,7 +120,6 @@ class Affine:
             raise InputError(f"matrix has shape {self.matrix.shape}, but must have {wanted}.")
 
     def __repr__(self) -> str:
-        """Return a text with a checksum of ``base`` and ``matrix``."""
         return f"Affine({sha256(self.base.tobytes() + self.matrix.tobytes()).hexdigest()[:16]})"
 
     def parameter(self, u: np.ndarray) -> np.ndarray:
@@ -228,8 +227,6 @@ class Transformed(OtherParameters):
 
 
 class TransformedPass:
-    """A forward pass at coordinates. Its backward pass returns derivatives with respect to the coordinates."""
-
     def __init__(self, forward_pass: ForwardPass, coordinates: Mapping[str, Bijector], u: Mapping[str, Any]):
         self._pass, self._coordinates, self._u = forward_pass, coordinates, u
         self.loss = forward_pass.loss
@@ -255,8 +252,7 @@ class FixedParameters(OtherParameters):
     """A problem with some parameters fixed, as a function of the remaining parameters."""
 
     def __init__(self, problem: Problem, fixed: Arrays):
-        """Store a problem and ``fixed`` parameters by name. The fixed parameters must include ``initial_positions`` (n,
-        d) [m]."""
+        """``fixed`` must include ``initial_positions`` (n, d) [m]."""
         self.problem, self._fixed, of = problem, fixed, problem.simulation
         self.simulation = SimpleNamespace(
             batch=None, scene=of.scene, positions=fixed["initial_positions"], precision=of.precision, known=of.known

@@ -38,8 +38,6 @@ SHORTEST = 0.05
 
 @dataclass(frozen=True)
 class Products:
-    """Products of Jacobians and residuals for all pairs of frames."""
-
     S: np.ndarray
     """Products of two frames' Jacobians and the noise covariance (F, F, p, p)."""
     K: np.ndarray
@@ -59,7 +57,7 @@ class Products:
 
 @dataclass(frozen=True)
 class ScoreCovariance:
-    """The covariance of an observation's score, which is the transposed Jacobian times the noise."""
+    """The covariance of the score, which is the transposed Jacobian times the noise."""
 
     B: np.ndarray
     """Covariance of the score (p, p)."""
@@ -70,8 +68,7 @@ class ScoreCovariance:
     frames: float
 
     def degrees_of_freedom(self, inverse: np.ndarray, direction: np.ndarray) -> float:
-        """Return Satterthwaite's degrees of freedom (1946) for the linear combination of parameters along ``direction``
-        (p,)."""
+        """Return the degrees of freedom of the estimate along ``direction`` (p,), as in Satterthwaite (1946)."""
         F, a = len(self.products.gram), inverse @ direction
         total, spread = _moments(np.einsum("p,fgpq,q->fg", a, self.products.S, a, optimize=True), F)
         return max(min(F * total / spread * (1.0 - self.lost), self.frames * self.samples), 1.0)
@@ -103,15 +100,13 @@ def correlation_time(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, times: n
 
 
 def independent_frames(times: np.ndarray, correlation_time: float) -> float:
-    """Return the effective number of independent frames, F (1 - c) / (1 + c). F is the number of frames, and c is the
-    correlation of the noise in neighbouring frames."""
+    """Return the effective number of frames, F (1 - c) / (1 + c), for a correlation c of neighbouring frames."""
     c = np.exp(-np.median(np.diff(times)) / correlation_time) if correlation_time else 0.0
     return float(len(times) * (1.0 - c) / (1.0 + c))
 
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
-    """Estimate the covariance of the score from weighted, whitened residuals r (F, m) and Jacobians J (F, m, p).
-    ``inverse`` is the inverse Hessian, and ``frames`` is the result of `independent_frames`."""
+    """Estimate the score's covariance from whitened residuals r (F, m), Jacobians J (F, m, p) and N^-1."""
     F, products = len(r), Products.of(J, r)
     B = np.einsum("ffpq->pq", products.S)
     once = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse, products.S, optimize=True) / F
@@ -145,8 +140,7 @@ class FittedPart:
     part: Part
     weighting: Weighting
     residuals: np.ndarray
-    """Predicted minus measured numbers (frames, m), in the unit of the observation. The residuals of ignored numbers
-    are 0."""
+    """Predicted minus measured numbers (frames, m), in the unit of the observation. Ignored numbers have 0."""
     spread: float
     samples: float
     frames: float
@@ -162,10 +156,8 @@ class FittedPart:
 
 @dataclass(frozen=True)
 class Certainty:
-    """Hessian, covariance and degrees of freedom of an estimate, from its residuals."""
-
     hessian: np.ndarray
-    """Hessian (free, free), computed from the weighted Jacobians."""
+    """Hessian (free, free) of the weighted sum of squares."""
     covariance: np.ndarray
     """Covariance (free, free) of the fitted coordinates."""
     degrees_of_freedom: np.ndarray
@@ -175,8 +167,6 @@ class Certainty:
 
     @classmethod
     def of(cls, problem: LeastSquares, at: Linearised, weights: Weights) -> "Certainty":
-        """Compute the certainty at a point. Raises `ComputationError` if a combination of parameters is not
-        determined."""
         N = hessian(problem, at, weights)
         N_inverse = inverse(problem, N)
         scores, parts = list[ScoreCovariance](), list[FittedPart]()
@@ -214,13 +204,12 @@ def noise_of(problem: LeastSquares, at: Linearised, weights: Weights) -> list[We
 
 
 def hessian(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return the Hessian (free, free), computed from the weighted Jacobians."""
     flat = (J.reshape(-1, len(at.u)) for J in weighted(problem.parts, weights, at.jacobians))
     return np.asarray(sum(J.T @ J for J in flat))
 
 
 def inverse(problem: LeastSquares, N: np.ndarray) -> np.ndarray:
-    """Return the inverse of the Hessian N (free, free), or raise `ComputationError` if it does not exist."""
+    """Return the inverse of the Hessian N (free, free), or raise `ComputationError` if there is none."""
     labels, size = problem.labels, np.sqrt(np.diag(N))
     if not np.isfinite(N).all():
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")

@@ -1,5 +1,4 @@
-"""Sentences of doubt about a fitted model if its residuals are larger than the noise. The sentences name possible
-causes.
+"""Sentences of doubt about a fitted model, with possible causes, if residuals are larger than the noise.
 
 Possible causes are a trend, a late clock, a wrong density, or slipping walls. Each cause changes the predictions along
 a direction. The size of the change is fitted together with the parameters, with an error bar.
@@ -21,16 +20,12 @@ from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE_IN_MOTION = 2.0
-"""A sentence warns if the residuals of changing predictions exceed the residuals of constant predictions by this
-factor."""
+"""Least ratio of residuals of changing predictions to residuals of constant predictions for a doubt."""
 EXACT = 1e-4
-"""Residuals below this fraction of the largest measured number are negligible, for instance in simulated
-measurements."""
+"""Residuals below this fraction of the largest measured number are negligible."""
 
 
 def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> tuple[str, ...]:
-    """Return sentences of doubt about a fit. There are none if the residuals look like noise and determine the
-    parameters."""
     found, is_exact = list[str](), True
     for part, r, weight in zip(problem.parts, at.residuals, weights, strict=True):
         times, noise, size = part.observation.times, part.observation.noise, spread(r)
@@ -71,9 +66,7 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return the root mean square residuals of numbers with constant predictions, such as the background of a video.
-    The second result is the same for all other numbers. With fewer than 20 constant predictions, return infinity and 0.
-    """
+    """Return root mean square residuals of constant predictions, such as a background, and of other predictions."""
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
     still = counted & (change <= 0.01 * np.max(change[counted], initial=0.0))
@@ -84,7 +77,7 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
 
 
 def _halves(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> list[str]:
-    """Return sentences on parameters with different estimates from the first and the second half of the frames."""
+    """Return sentences on parameters whose estimates from the first and second half of the frames differ."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -107,7 +100,7 @@ def _halves(problem: LeastSquares, at: Linearised, weights: Weights, certainty: 
 
 
 class Explained(NamedTuple):
-    """The sizes of possible causes of residuals (causes,), and the explained fraction of the sum of squares."""
+    """The sizes of possible causes (causes,), and the fraction of the sum of squares that these causes explain."""
 
     sizes: np.ndarray
     share: float
@@ -116,8 +109,7 @@ class Explained(NamedTuple):
 def explained(
     problem: LeastSquares, at: Linearised, weights: Weights, columns: Sequence[np.ndarray], is_doubted: bool = False
 ) -> Explained | None:
-    """Estimate the sizes of possible causes of residuals by a Gauss-Newton step. Return None if the sizes are within
-    the noise or undetermined.
+    """Estimate the sizes of possible causes by a Gauss-Newton step. Return None if noise can explain the residuals.
 
     ``columns`` are derivatives (frames, m, causes) of the predictions of each observation. If ``is_doubted`` is true,
     the residuals are not noise, and the causes must explain half of the sum of squares.
@@ -160,8 +152,7 @@ def explained(
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences on the density of the fluid and the slip of the container. The function needs
-    additional runs."""
+    """Return sentences on causes that need additional runs: a wrong density, or slip."""
     values, found = problem.coordinates.values(at.u), list[str]()
 
     def by_density(experiment: Experiment, own: Arrays) -> Arrays:
@@ -209,7 +200,7 @@ def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
 
 
 def _trends_and_clocks(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences on trends of observations with at most four numbers per frame, and on late clocks."""
+    """Return sentences on late clocks, and on trends of observations with at most four numbers per frame."""
     found, late = list[str](), list[str]()
     for k, part in enumerate(problem.parts):
         times, measured = part.observation.times, part.observation.measured

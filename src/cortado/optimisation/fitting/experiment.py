@@ -21,7 +21,7 @@ from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
 
 ROOM = 16
-"""Number of additional steps of a run, because a clock may be late."""
+"""Number of additional steps of a run for a late clock."""
 
 
 @fixed
@@ -78,15 +78,13 @@ class Experiment:
 
     @property
     def unseen(self) -> Arrays:
-        """Return a mask for each parameter of `start`. The mask is true for components that do not affect any
-        measurement."""
+        """Return masks by name of a parameter in `start`. A mask is true for components without any effect."""
         each = self.observations.items()
         return {f"{name}.{key}": mask for name, one in each for key, mask in getattr(one, "unseen", {}).items()}
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """Return the bounds of each calibrated clock [s]. The bounds are half of the measurement's duration before and
-        after the clock's initial value."""
+        """Return the bounds of each clock [s]. A clock may move by half of the duration of its measurement."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -99,8 +97,7 @@ class Experiment:
         return Experiment(simulation, self.observations, self.problem.steps, self._state)
 
     def measured_again(self, measured: Mapping[str, np.ndarray]) -> "Experiment":
-        """Return this experiment with new measured numbers (frames, m) by observation name. The two experiments share
-        all other data."""
+        """Return this experiment with new measured numbers (frames, m) by observation name."""
         found = object.__new__(Experiment)
         again = {n: Again(one, measured[n]) if n in measured else one for n, one in self.observations.items()}
         found.__dict__ |= {**self.__dict__, "observations": FixedDict(again)}
@@ -152,7 +149,7 @@ class Experiment:
         return self._read(ends, frames, parameters), found
 
     def _frames(self, parameters: Values) -> tuple[dict[str, Frames], list[int]]:
-        """Return the frames of each observation, and the steps whose states they need."""
+        """Return the frames of each observation, and the steps whose states the frames need."""
         found, wanted = dict[str, Frames](), set[int]()
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
@@ -163,7 +160,7 @@ class Experiment:
         return found, sorted(wanted)
 
     def _problem(self, values: Values, wanted: Sequence[int]) -> Problem:
-        """Return a problem that covers the ``wanted`` steps. Its viscosity scheme suits the given values."""
+        """Return a problem that covers the ``wanted`` steps. The viscosity may need an implicit scheme."""
         scene, steps = self.simulation.scene, self.problem.steps
         if wanted[-1] > steps:
             steps += -(-(wanted[-1] - steps) // ROOM) * ROOM

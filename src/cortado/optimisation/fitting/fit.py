@@ -260,8 +260,7 @@ def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error. The error is rounded to two digits if its first digit is 1 to 3, and
-    otherwise to one digit."""
+    """Format a value and its standard error. An error that begins with 1 to 3 has two digits, or else one digit."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -272,7 +271,6 @@ def with_error(value: float, error: float) -> str:
 
 
 def unit_of(label: str) -> str:
-    """Return the unit of the fitted number with this label, or an empty text."""
     name = label.partition("[")[0]
     return UNITS.get(name) or OF_VIEWS.get(name.rpartition(".")[2], "")
 
@@ -313,7 +311,7 @@ def fit(
     Example::
 
         fit = cortado.fit(experiment, {"viscosity": 0.1}, bounds={"viscosity": (0.01, 1.0)})
-        print(fit.parameters["viscosity"])
+        print(fit.values["viscosity"])
     """
     each = [experiments] if isinstance(experiments, Experiment) else experiments
     if not isinstance(each, list | tuple) or not all(isinstance(one, Experiment) for one in each):
@@ -389,7 +387,7 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
-    """Return the searches that ended in different local minima than ``found``, sorted by misfit."""
+    """Return the searches with other ends than ``found``, sorted by misfit."""
     bars = np.sqrt(np.diag(found.coordinate_covariance))
     near = SAME * np.where(found.coordinates.by_logarithm, 1.0, np.abs(found.u))
     others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]

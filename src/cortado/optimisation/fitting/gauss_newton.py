@@ -1,10 +1,9 @@
 """Minimise the sum of squares in few runs, by Gauss-Newton steps. The Jacobian is estimated from earlier runs.
 
-Predictions of particle simulations are rough functions of a parameter. The derivative with respect to a parameter may
-be much greater than the mean slope over one standard error of the parameter. Error bars that are computed from this
-derivative are then too small. At the end of a search, `over_the_bars` therefore runs simulations two standard errors
-away from the minimum. If the derivatives do not predict the results, finite differences over two standard errors
-replace the derivatives.
+Predictions of particle simulations are rough functions of a parameter. A derivative may be much greater than the mean
+slope over one standard error, and error bars from this derivative are then too small. At the end of a search,
+`over_the_bars` therefore runs simulations two standard errors away from the minimum. If the derivatives do not predict
+the results, finite differences over two standard errors replace the derivatives.
 """
 
 from collections.abc import Sequence
@@ -28,16 +27,18 @@ REACH = 2.0
 @dataclass(frozen=True)
 class Searched:
     at: Linearised
-    """Last point of the search, with an estimated Jacobian."""
+    """Last point, with an estimated Jacobian."""
     next: np.ndarray
-    """Next trial point of the search (free,). No simulation was run at this point."""
+    """Next trial point (free,), at which no simulation was run."""
     gain: float
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) -> tuple[Linearised, bool]:
-    """Minimise the sum of squares, first with estimated Jacobians and then with forward-mode derivatives. Return the
-    minimum and True. If the minimum is not found with ``trials`` trial points, return the lowest point and False."""
+    """Return the minimum of the sum of squares and True, or the lowest of ``trials`` points and False.
+
+    Jacobians are first estimated from runs. At the end, forward mode computes the Jacobian.
+    """
     for _ in range(4):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, 9.0 / squares)  # a decrease of three standard errors
@@ -59,11 +60,10 @@ def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) 
 def search(
     problem: LeastSquares, at: Linearised, weights: Weights, trials: int, enough: float, fixed: Sequence[int] = ()
 ) -> Searched:
-    """Reduce the sum of squares until the next step would reduce it by less than the fraction ``enough``. The
-    coordinates ``fixed`` stay constant.
+    """Reduce the sum of squares until the next step would reduce the sum by less than the fraction ``enough``.
 
-    Each trial point needs one forward run. The Jacobian is estimated from all trial points. If a trial point does not
-    reduce the sum of squares, or if its run diverges, the next step is damped (Levenberg 1944, Marquardt 1963).
+    The coordinates ``fixed`` stay constant. Each trial point needs one forward run. If a trial point does not help or
+    its run diverges, the next step is damped (Levenberg 1944, Marquardt 1963).
     """
     points, base = TrialPoints(problem, weights, at), 0
     failures, damping, lowest = 0, 0.0, problem.sum_of_squares(at.residuals, weights)
@@ -100,8 +100,7 @@ def search(
 def next_point(
     problem: LeastSquares, at: Linearised, weights: Weights, damping: float = 0.0, fixed: Sequence[int] = ()
 ) -> tuple[np.ndarray, float]:
-    """Minimise the sum of squares of the linear model within the bounds. Return the minimum (free,) and the decrease of
-    the sum of squares."""
+    """Return the minimum (free,) of the linear model within the bounds, and the decrease of the sum of squares."""
     from scipy.optimize import lsq_linear
 
     free = np.setdiff1d(np.arange(len(at.u)), fixed)
@@ -121,9 +120,10 @@ def next_point(
 
 
 def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tuple[Linearised, bool | None]:
-    """Check the derivatives at the end of a search. If the check succeeds, return the point and None. If the check
-    fails, compute finite differences over `REACH` standard errors. Then return the point with the new Jacobian, and
-    True if the differences converged."""
+    """Check the derivatives. After a failed check, return finite differences over `REACH` standard errors.
+
+    The second result is None after a successful check, or else whether the differences converged.
+    """
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -143,8 +143,7 @@ def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tu
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return uncorrelated displacements of `REACH` standard errors, as the columns of a matrix (free, free). A
-    displacement is at most as long as a step of the search."""
+    """Return uncorrelated displacements of `REACH` standard errors, as columns of a matrix (free, free)."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     logarithmic = problem.coordinates.by_logarithm
@@ -170,10 +169,9 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: 
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Weights, axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """Return the point with a Jacobian of finite differences along the axes. Also return all points of the differences.
+    """Return the point with a Jacobian of finite differences along the axes, and all points of the differences.
 
-    Of the two one-sided differences and the central difference, the smallest is used, because the point may lie on a
-    kink.
+    The point may lie on a kink. Of both one-sided differences and the central difference, the smallest is used.
     """
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
@@ -193,8 +191,7 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Run the simulations at the point displaced by ``shift``, within the bounds. Return an empty list if a run
-    diverges."""
+    """Return the displaced point within the bounds, or an empty list if its run diverges or the point is the same."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []
@@ -203,16 +200,14 @@ def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Lin
 
 
 def misfit(problem: LeastSquares, residuals: list[np.ndarray]) -> float:
-    """Return the mean logarithm of the residuals' size. For Gaussian noise, the likelihood is greatest where this mean
-    is smallest."""
+    """Return the mean logarithm of the residuals' size. The likelihood for Gaussian noise falls with this mean."""
     counts = [np.count_nonzero(~np.isnan(part.observation.measured)) for part in problem.parts]
     return float(np.average([np.log(max(spread(r), TINY)) for r in residuals], weights=counts))
 
 
 def other_starts(problem: LeastSquares, count: int) -> list[np.ndarray]:
-    """Return at most ``count`` starting points (free,) from a Sobol sequence, with the smallest `misfit` first. The
-    points lie between the bounds. Positive parameters without bounds vary by a factor of 100 up and down. Other
-    parameters without bounds do not vary."""
+    """Return at most ``count`` starts (free,) from a Sobol sequence, with the smallest `misfit` first. Positive
+    parameters without bounds vary by a factor of 100 up and down. Other parameters without bounds do not vary."""
     from scipy.stats import qmc
 
     start, (lower, upper) = problem.coordinates.start, problem.coordinates.bounds

@@ -45,9 +45,8 @@ class Coordinates:
     def of(
         cls, start: Mapping[str, Any], positive: Iterable[str], bounds: Bounds | None, unseen: Arrays | None = None
     ) -> "Coordinates":
-        """Make coordinates for initial values. ``positive`` parameters are fitted by their logarithm if all of their
-        components are above 0. ``unseen`` is a mask of components that are not fitted. Raises `InputError` for
-        unsuitable arguments."""
+        """Make coordinates. ``positive`` parameters are fitted by their logarithm if all components are above 0.
+        ``unseen`` has masks of components that are not fitted."""
         values = checked_start(start)
         by_logarithm = {name for name in positive if name in values and (values[name] > 0.0).all()}
         ends = checked_bounds({} if bounds is None else bounds, values)
@@ -79,7 +78,7 @@ class Coordinates:
 
     @property
     def labels(self) -> list[str]:
-        """Return the names of the fitted components. Components of an array have an index, as in "gravity[1]"."""
+        """Return the names of the fitted components, such as "gravity[1]"."""
         found = list[str]()
         for name, shape in zip(self.names, self.shapes, strict=True):
             found += [f"{name}[{', '.join(map(str, k))}]" if shape else name for k in np.ndindex(*shape)]
@@ -87,7 +86,6 @@ class Coordinates:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds (free,) of the coordinates."""
         with np.errstate(divide="ignore"):
             logs = [np.where(self.logarithmic, np.log(np.maximum(e, 0.0)), e) for e in (self.lower, self.upper)]
         return logs[0][self.free], logs[1][self.free]
@@ -101,7 +99,7 @@ class Coordinates:
         return np.where(is_log, np.log(np.where(is_log, chosen, 1.0)), chosen)
 
     def numbers(self, u: np.ndarray) -> np.ndarray:
-        """Return the fitted components (free,) at coordinates u (free,), in the units of the parameters."""
+        """Return the fitted components (free,) in the units of the parameters."""
         with np.errstate(over="ignore"):  # an interval may have no upper end
             return np.where(self.by_logarithm, np.exp(np.where(self.by_logarithm, u, 0.0)), u)
 
@@ -117,8 +115,7 @@ class Coordinates:
         return {n: whole[ends[k] : ends[k + 1]].reshape(self.shapes[k]) for k, n in enumerate(self.names)}
 
     def directions(self, u: np.ndarray) -> list[Arrays]:
-        """Return the derivatives of the parameters with respect to each coordinate. Parameters with zero derivative are
-        left out."""
+        """Return the derivatives of the parameters with respect to each coordinate. Zero derivatives are left out."""
         found, slopes = [], self.slopes(u)
         for k, place in enumerate(np.flatnonzero(self.free)):
             whole = np.zeros(len(self.at_start))
@@ -127,16 +124,14 @@ class Coordinates:
         return found
 
     def spread(self, free: np.ndarray, otherwise: float | np.ndarray) -> Arrays:
-        """Convert fitted components (free,) to parameter arrays by name. Components that are not fitted are set to
-        ``otherwise``."""
+        """Convert fitted components (free,) to arrays by name. All other components are ``otherwise``."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Remove the correlation between successive frames from values (frames, ...). The standard deviation does not
-    change."""
+    """Make frames of ``values`` (frames, ...) uncorrelated. The standard deviation does not change."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -145,9 +140,6 @@ def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> 
 
 @dataclass(frozen=True)
 class Part:
-    """An observation of an experiment. ``label`` contains the name of the observation. With several experiments, the
-    label also contains the number of the experiment."""
-
     experiment: int
     name: str
     label: str
@@ -162,17 +154,15 @@ class Weighting:
     correlation_time: float = 0.0
 
     def of(self, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Remove the correlation of values (frames, ...) over time (`whitened`), and divide the values by the scale."""
         return whitened(values, times, self.correlation_time) / self.scale
 
 
 Weights = Sequence[Weighting]
-"""A weighting for each observation."""
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and Jacobians of all observations at coordinates u (free,), in the units of the measurements."""
+    """Residuals and Jacobians at coordinates u (free,), in the units of the measurements."""
 
     u: np.ndarray
     residuals: list[np.ndarray]
@@ -200,11 +190,8 @@ class LeastSquares:
             for name, one in experiment.observations.items()
         ]
         self.runs = self.tangents = self.refused = 0
-        """Number of forward runs. ``tangents`` is the number of forward-mode derivatives, and ``refused`` is the number
-        of diverged runs."""
 
     def residuals(self, u: np.ndarray) -> list[np.ndarray]:
-        """Return the residuals of each observation at coordinates u. Raises `DivergedError` if a run diverges."""
         found = [self._run(k, self.coordinates.values(u), ())[0] for k in range(len(self.experiments))]
         if self._on_trial is not None:
             self._on_trial()
@@ -212,9 +199,8 @@ class LeastSquares:
         return [np.nan_to_num(predicted - measured, nan=0.0) for predicted, measured in each]
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """Return residuals and estimated Jacobians at a point. Derivatives with respect to logarithms of parameters are
-        finite differences, because forward runs are cheaper than forward-mode runs. Raises `DivergedError` if a run
-        diverges."""
+        """Return residuals and estimated Jacobians. Derivatives with respect to logarithms are finite differences,
+        because forward runs are cheaper than forward-mode runs."""
         positive = self.coordinates.by_logarithm
         at = self.linearised(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
@@ -229,8 +215,7 @@ class LeastSquares:
         return at
 
     def linearised(self, u: np.ndarray, columns: Iterable[int] | None = None) -> Linearised:
-        """Return residuals and Jacobians at a point. Derivatives with respect to coordinates outside
-        ``columns`` are 0."""
+        """Return residuals and Jacobians. Derivatives for coordinates outside ``columns`` are 0."""
         every, values = self.coordinates.directions(u), self.coordinates.values(u)
         directions = {number: every[number] for number in (range(len(u)) if columns is None else columns)}
         residuals, jacobians = list[np.ndarray](), list[np.ndarray]()
@@ -266,8 +251,7 @@ class LeastSquares:
             raise
 
     def values_of(self, experiment: int, values: Arrays) -> Arrays:
-        """Select the values of one experiment's parameters. Parameters that only other experiments have are
-        left out."""
+        """Select the values of one experiment. Other experiments may have parameters of their own."""
         others = {name for one in self.experiments for name in one.start} - set(self.experiments[experiment].start)
         return {name: value for name, value in values.items() if name not in others}
 
@@ -287,7 +271,7 @@ class TrialPoints:
         self._points.append(u)
         self._residuals.append(residuals)
         self.are_many = len(self._points) >= 5 * (len(u) + 1)
-        """True if the points need too much memory. The search should then start again at the lowest point."""
+        """True if the points need too much memory. The search should then start again."""
         return len(self._points) - 1
 
     def linearised(self, number: int) -> Linearised:
@@ -301,8 +285,7 @@ class TrialPoints:
 
 
 def slope_weights(x: np.ndarray, products: np.ndarray, number: int) -> np.ndarray:
-    """Return the weights (d, points) of a weighted sum that estimates the gradient at point ``number`` from values at
-    the points ``x`` (points, d)."""
+    """Return weights (d, points) of values at the points ``x`` (points, d) for the gradient at point ``number``."""
     from scipy.linalg import null_space
     from scipy.spatial.distance import cdist
 

@@ -79,7 +79,7 @@ class Again:
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of an observation, for linear interpolation between the states of a run."""
+    """Frames of an observation, interpolated linearly between states of a run."""
 
     steps: np.ndarray
     """Number of steps before each frame (frames,)."""
@@ -88,7 +88,6 @@ class Frames:
 
     @classmethod
     def of(cls, times: np.ndarray, time_step: float, steps: int) -> "Frames":
-        """Make frames for times [s]. Raises `InputError` for times after the end of the run."""
         places = times / time_step
         if places[-1] > steps + 1e-6:
             said = f"times go up to {times[-1]:g} s"
@@ -106,13 +105,11 @@ class Frames:
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` maps step numbers to
-        readings."""
+        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` is by step number."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return readings interpolated to the times of the frames (frames, ...). ``read`` maps step numbers to
-        readings."""
+        """Return readings interpolated to the frames (frames, ...). ``read`` is by step number."""
         last = max(read)
         after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
@@ -121,8 +118,7 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
-    """Return the parameter "start" with the value ``start`` if ``calibrate`` contains its name. If ``alone`` is true,
-    any other name in ``calibrate`` raises `InputError`."""
+    """Return the parameter "start" if ``calibrate`` has its name. ``alone`` forbids other names."""
     for name in calibrate if alone else ():
         if name != CLOCK:
             raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
@@ -130,8 +126,7 @@ def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Return the times plus ``clock`` [s], the measured values, and the noise as checked arrays. Raises `InputError`
-    for unsuitable arrays."""
+    """Return the times plus ``clock`` [s], the measured values, and the noise."""
     late = as_one_number("clock", clock)
     if not np.isfinite(late):
         raise InputError(f"clock is {late:g}, but must be a finite number of seconds.")
@@ -287,8 +282,7 @@ class SensorSeries:
         return value_of(self.sensor, at)[self._picked]
 
     def tangents(self, at: Snapshot, own: Mapping[str, np.ndarray], along: Sequence[Direction]) -> np.ndarray:
-        """Return the derivatives along directions. Adjoints compute the derivatives, because sensors have no forward
-        mode."""
+        """Sensors have no forward mode. Adjoints therefore give the derivatives along directions."""
         rows = [self.sensor.adjoint(at, np.eye(self._width)[k]) for k in self._picked]
         others = [name for name in rows[0] if along and name not in along[0].fields]
         found = np.zeros((len(rows), len(along)))
