@@ -46,8 +46,7 @@ ROUGHLY = 0.1
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: whether the adjoint is right, for how many steps it is useful, and which estimator to
-    use."""
+    """The result of `certify`: whether gradients are right, how long they are useful, and which estimator to use."""
 
     particles: int
     steps: int
@@ -57,8 +56,7 @@ class Certificate:
     loss_changes: dict[str, float]
     """Predicted change of the loss for a meaningful perturbation of each parameter."""
     consistency: Consistency
-    """Comparison of the derivatives by reverse mode, forward mode and finite differences, for all parameters
-    together."""
+    """Comparison of derivatives by reverse mode, forward mode and finite differences, for all parameters."""
     wrong: tuple[str, ...]
     """Names of the parameters with a wrong derivative. Empty if all derivatives are right."""
     norms: np.ndarray
@@ -70,8 +68,7 @@ class Certificate:
     alignment: Alignment | None
     """Comparison of each estimator's gradient with the smoothed gradient, or None without a smoothed gradient."""
     beside: Consistency | None = None
-    """Comparison of the derivatives after small random changes of the initial state. None if the loss has no corner at
-    the initial state."""
+    """Comparison of derivatives near the initial state. None if the loss has no corner at the initial state."""
     beyond: tuple[str, ...] = ()
     """Sentences that say which steps could not be checked because a particle was lost."""
 

@@ -115,8 +115,6 @@ def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
 
 @dataclass(frozen=True, repr=False)
 class StepBar:
-    """Derivatives of a loss with respect to the parameters of a step."""
-
     row: int
     """Number of the step in the run, counted from 0."""
     parameters: Mapping[str, np.ndarray]

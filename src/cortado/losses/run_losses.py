@@ -118,8 +118,7 @@ class CheckedLoss:
 
 @runtime_checkable
 class BatchedLoss(Protocol):
-    """Protocol of a loss that is computed for all scenes of a batch together. The results must be bitwise equal to the
-    losses of single scenes."""
+    """Protocol of a loss for all scenes of a batch. Results must be bitwise equal to losses of single scenes."""
 
     def values(self, end: SnapshotBatch) -> np.ndarray:
         """Return the losses (batch,). The loss of a diverged scene is arbitrary."""

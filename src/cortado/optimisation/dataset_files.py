@@ -60,7 +60,6 @@ class DatasetFolder:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Return the metadata, or an empty table if the file is damaged or missing."""
         try:
             return dict(parsed_json((self.out / METADATA).read_bytes()))
         except (OSError, ValueError, TypeError):
@@ -68,7 +67,6 @@ class DatasetFolder:
 
     @property
     def runs(self) -> dict[int, FinishedRun]:
-        """Return the finished runs by number."""
         return self._read[0]
 
     @property

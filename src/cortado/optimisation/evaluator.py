@@ -60,8 +60,7 @@ class Record:
     replayed: bool
     """True if the evaluation comes from the checkpoint."""
     refused: int = 0
-    """Number of refused steps before this evaluation. A step is refused if its run diverges or its parameters are out
-    of range."""
+    """Number of refused steps before this evaluation, as in `Result.refused`."""
     left_out: int = 0
     """Number of failed runs that ensemble averages ignored so far. Replayed evaluations are not counted."""
 

@@ -86,8 +86,7 @@ class Result:
     """Number of steps that were refused because the run diverged or a parameter was out of range. The history does not
     contain refused steps."""
     left_out: int = 0
-    """Number of runs that were left out of averages over ensembles, for the same reasons as in `refused`. Runs that
-    were replayed from the checkpoint are not counted."""
+    """Number of failed runs that ensemble averages ignored. Replayed evaluations are not counted."""
     misled: bool = False
     """True if the gradient disagreed with the change of the loss. Do not trust the search then; `message` gives advice.
     Gradients are often wrong beyond the horizon of `cortado.certify`."""

@@ -179,8 +179,7 @@ class Search:
     attempt: Callable[[Vector], tuple[float, Vector] | None]
     """Function that maps a vector (size,) to the loss and the gradient (size,), or to None for a failed run."""
     losses: Callable[[Sequence[Vector]], list[float]]
-    """Function that maps several vectors (size,) to their losses, without gradients. The loss of a failed run is
-    infinite."""
+    """Function that maps several vectors (size,) to their losses. The loss of a failed run is infinite."""
     layout: ParameterLayout
     """Order and shapes of the parameters in the vector."""
     start: Vector

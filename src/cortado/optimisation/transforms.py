@@ -75,8 +75,7 @@ class Softmax:
 
 @dataclass(frozen=True)
 class TimeInterpolation:
-    """Linear interpolation in time. Values u (k, d) at evenly spaced knots give values p (steps, d) at all
-    time steps."""
+    """Linear interpolation in time, from values u (k, d) at evenly spaced knots to values p (steps, d)."""
 
     steps: int
     knots: int
@@ -112,8 +111,7 @@ class Affine:
     """The transform p = base + matrix u, for example for accelerations of a tank with a fixed end position."""
 
     def __init__(self, base: Any, matrix: Any):
-        """Store the transform. ``base`` has the shape and unit of the parameter, and ``matrix`` has the shape
-        ``base.shape + u.shape``."""
+        """``base`` has the shape and unit of the parameter. ``matrix`` has the shape ``base.shape + u.shape``."""
         self.base, self.matrix = read_only("base", base), read_only("matrix", matrix)
         if self.matrix.shape[: self.base.ndim] != self.base.shape or self.matrix.ndim == self.base.ndim:
             wanted = f"{self.base.shape}, the shape of base, followed by the shape of the coordinates"
@@ -207,8 +205,7 @@ class Transformed(OtherParameters):
     def estimate(
         self, u: Mapping[str, Any], gradient: GradientEstimator | None = None, observe: Observer | None = None
     ) -> Estimate:
-        """Estimate the loss and the gradient at coordinates u. The spread of an ensemble is in units of the
-        coordinates."""
+        """Estimate loss and gradient at coordinates u. The spread of an ensemble is in units of the coordinates."""
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":

@@ -87,8 +87,7 @@ class Fit:
     coordinate_covariance: np.ndarray = field(repr=False)
     """Covariance of the coordinates (free, free)."""
     naive_covariance: np.ndarray = field(repr=False)
-    """Covariance (free, free) under the wrong assumption that all measured numbers are independent. The values are far
-    too small and serve only for comparison."""
+    """Covariance (free, free) if all measured numbers were independent. The values serve only for comparison."""
     degrees_of_freedom: np.ndarray = field(repr=False)
     """Degrees of freedom of Student's t-distribution (free,)."""
     parts: tuple[FittedPart, ...] = field(repr=False)
@@ -132,8 +131,7 @@ class Fit:
 
     @property
     def standard_errors(self) -> dict[str, Any]:
-        """Return the standard errors by name, in the shape and unit of each parameter. The error of a number that is
-        not fitted is 0."""
+        """Return standard errors in the shapes of the parameters. The error of a fixed number is 0."""
         return _plain(self.coordinates.spread(np.sqrt(np.diag(self.covariance)), 0.0))
 
     @property
@@ -144,8 +142,7 @@ class Fit:
 
     @property
     def not_told_apart(self) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of labels with strongly correlated estimates, together with the correlation. Its absolute value
-        is above 0.9."""
+        """Return pairs of labels whose correlation is above 0.9 in absolute value, with the correlation."""
         found, labels = self.correlation, self.labels
         pairs = combinations(range(len(labels)), 2)
         return tuple((labels[i], labels[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > 0.9)
