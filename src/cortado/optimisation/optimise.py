@@ -241,9 +241,8 @@ def optimise(
         settings: settings of a named optimiser, as in
             ``optimise(problem, start, "adam", learning_rate=0.1, iterations=50)``.
 
-    A step is refused if its run diverges or if a parameter is out of range. Adam and gradient descent then halve the
-    step until it succeeds, and shorten all later steps too. The line searches take shorter trials. `Result.refused`
-    counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
+    A step is refused if its run diverges or if a parameter is out of range. The optimiser then takes a shorter step.
+    `Result.refused` counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
 
     Raises InputError for unsuitable ``start``, ``bounds`` or settings, and for a checkpoint of another run. Raises
     DivergedError if the run at the start diverges, or after a step was halved ten times. Raises ComputationError if a

@@ -73,8 +73,7 @@ class Adam:
 
     A step changes a component by at most about the learning rate, for gradients of any size. Every update ends with a
     projection onto the bounds. If the run after a step diverges, Adam halves the step and the learning rate, at most 10
-    times. Adam then also resets the means of the gradient and of the squared gradient to 0. Adam has no convergence
-    test and makes all iterations.
+    times, and resets both means to 0. Adam has no convergence test and makes all iterations.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1. Raises
     InputError for settings out of range.
@@ -168,8 +167,6 @@ class LBFGS:
     L-BFGS finds accurate optima of smooth losses in few evaluations, but stops early if the gradient is noisy. The
     coordinates are (x - start) / scale for parameters x, and the loss is divided by the greatest component of the first
     gradient in these coordinates. The first trial step is therefore at most about `scale` long.
-
-    If the run of a trial diverges, the next trial is about a quarter as long, and the approximate Hessian ignores it.
 
     With more than about 10^4 components the last bits of sums depend on the number of BLAS threads. Resume a large
     search with the same number of threads. If the numbers of a resumed run differ, an error is raised.
@@ -283,11 +280,8 @@ class LineSearch:
     first, and later 3 times the best length, at most 1. If no trial lowers the loss, the update still takes the best
     trial and sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one.
 
-    If every trial diverges, the parameters stay, the momentum is set to 0, and the reach is multiplied by ``shortest``.
-    If the gradient at the best trial diverges, the step and the reach are shortened. The method has no convergence test
-    and makes all iterations.
-
-    Raises InputError for settings out of range.
+    If every trial diverges, the parameters stay, and the reach is multiplied by ``shortest``. The method has no
+    convergence test and makes all iterations. Raises InputError for settings out of range.
 
     ``scale`` is the longest change of a parameter in a trial, as a number or as one number for each parameter by name
     [unit of the parameter]. ``trials`` is the number of lengths per update, at most 1,000. ``shortest`` is the ratio of

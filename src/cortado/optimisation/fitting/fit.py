@@ -182,8 +182,7 @@ class Fit:
         return Profile(label, values, np.array(deviance), shifts**2 / V[k, k])
 
     def log_posterior(self, u: Any) -> float:
-        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,). The function
-        computes one run.
+        """Return the logarithm of the posterior density, up to a constant, at coordinates ``u`` (free,), by one run.
 
         The prior is flat in the coordinates within the bounds. Coordinates of positive numbers are logarithms. The
         result is -inf outside the bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to
@@ -283,10 +282,9 @@ def fit(
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, with error bars.
 
-    A residual is a simulation's prediction minus the measured number. The search estimates the Jacobian with one
-    forward run for each fitted number. At the end of the search the Jacobian is computed by forward mode. The first fit
-    weights all residuals equally, and its residuals determine the weights of a second fit. The residuals of the second
-    fit determine the error bars (see `cortado.optimisation.fitting.certainty`).
+    A residual is a simulation's prediction minus the measured number. The first fit weights all residuals equally, and
+    its residuals determine the weights of a second fit. The residuals of the second fit determine the error bars (see
+    `cortado.optimisation.fitting.certainty`).
 
     Args:
         experiments: a `measured.Experiment`, or several with the same parameters.
