@@ -23,7 +23,7 @@ from warp._src.jax import xla_ffi
 
 from cortado.device.threads import WARP
 from cortado.errors import CortadoError
-from cortado.optimisation.layers.layer import Array, kept_or_made, on_host
+from cortado.optimisation.layers.layer import Array, fill, kept_or_made
 from cortado.rollout.device_states import flat_of
 
 Sizes = tuple[int, ...]
@@ -40,12 +40,11 @@ class ForeignFunction:
         self._function, self._number = function, next(_NUMBERS)
         finalize(self, _let_go, self._number)
 
-    def __call__(self, *arrays: Any, shapes: Sequence[Sizes], results: Sequence[Any]) -> list[Any]:
-        """Call the function with traced ``arrays``. The function returns arrays with the given ``shapes``. The call
-        returns arrays with the shapes and data types of ``results``."""
+    def __call__(self, *arrays: Any, results: Sequence[Any]) -> list[Any]:
+        """Call the function with traced ``arrays``. The call returns arrays with the shapes and data types of
+        ``results``. The function returns arrays of the same sizes."""
         given, made = Packing([(a.shape, a.dtype) for a in arrays]), Packing([(r.shape, r.dtype) for r in results])
-        own = Packing(list(zip(shapes, (result.dtype for result in results), strict=True)))
-        _CALLS[self._number] = self._function, given, own
+        _CALLS[self._number] = self._function, given, made
         packed = [jnp.concatenate([arrays[k].reshape(-1) for k in group]) for group in given.groups.values()]
         kinds = [jax.ShapeDtypeStruct((ends[-1],), dtype) for dtype, ends in made.ends.items()]
         return made.cut(jax.ffi.ffi_call(TARGET, kinds)(*packed, number=np.int64(self._number)))
@@ -96,13 +95,7 @@ class Packing:
                     wp.copy(result, flat, count=flat.size)
                     rest = group[len(there) :]
             for k in rest:
-                view, own = views[k], found[k]
-                if isinstance(view, np.ndarray):
-                    view[...] = on_host(own).reshape(view.shape)
-                elif isinstance(own, wp.array) and own.dtype == view.dtype:
-                    wp.copy(view, own.reshape(view.shape))
-                else:
-                    view.assign(on_host(own).reshape(view.shape))
+                fill(views[k], found[k])
 
 
 _NUMBERS = count(1)

@@ -171,6 +171,20 @@ def on_host(array: Array) -> np.ndarray:
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
+def fill(view: Array, array: Array) -> None:
+    """Copy an array to a ``view`` of the same size, on a GPU without the host if possible."""
+    if isinstance(view, np.ndarray):
+        view[...] = on_host(array).reshape(view.shape)
+    elif (
+        isinstance(array, wp.array)
+        and array.dtype == view.dtype
+        and (view.is_contiguous or array.device == view.device)
+    ):
+        wp.copy(view, array.reshape(view.shape))
+    else:
+        view.assign(on_host(array).reshape(view.shape))
+
+
 def part(given: Mapping[str, Any], kind: str) -> dict[str, Any]:
     return {name.removeprefix(kind): array for name, array in given.items() if name.startswith(kind)}
 
@@ -302,15 +316,8 @@ class NamedStates(HostStates):
                 packed.write()
                 views = {name: own for name, own in views.items() if name not in packed.views}
         for name, own in views.items():
-            if name not in given:
-                continue
-            array = given[name]
-            if isinstance(own, np.ndarray):
-                own[...] = array
-            elif isinstance(array, wp.array) and array.dtype == own.dtype and array.device == own.device:
-                wp.copy(own, array.reshape(own.shape))
-            else:
-                own.assign(on_host(array).reshape(own.shape))
+            if name in given:
+                fill(own, given[name])
 
     def _returned(
         self, fields: dict[str, Array], scenes: Sequence[RestartState], judged: bool = True

@@ -156,8 +156,7 @@ def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[...
         context.module_context.add_keepalive(foreign)
 
         def call(*traced: Any) -> list[Any]:
-            wanted = results(*traced, **options)
-            return foreign(*flattened(traced, sizes), shapes=[flat(own.shape, sizes) for own in wanted], results=wanted)
+            return foreign(*flattened(traced, sizes), results=results(*traced, **options))
 
         return mlir.lower_fun(call, multiple_results=True)(context, *arrays)
 
