@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from cortado.runs.recording import FrameChoice
 
 Work = Callable[[], str]
-"""A function that runs a command with parsed arguments and returns the text to print."""
 Scene = Annotated[Positional[Path], arg(metavar="SCENE.toml")]
 Task = Annotated[Positional[Path], arg(metavar="TASK.toml")]
 Flag = Annotated[bool, arg(help_behavior_hint="")]
@@ -40,8 +39,7 @@ STEPS = 200
 
 
 def command(group: SubcommandApp, answers: bool = False) -> Callable[[Callable[..., Work]], Callable[..., Work]]:
-    """Return a decorator that adds a function to a group of commands. The option --quiet hides the returned text,
-    unless ``answers`` is true."""
+    """The option --quiet hides the returned text, unless ``answers`` is true."""
 
     def register(function: Callable[..., Work]) -> Callable[..., Work]:
         @wraps(function)
@@ -80,7 +78,6 @@ class Program:
         return self.app.cli(prog=self.name, description=self.description, args=arguments, config=config)
 
     def completion_script(self, shell: str) -> str:
-        """Return the completion script for a shell."""
         box = io.StringIO()
         with redirect_stdout(box), suppress(SystemExit):
             self.parsed(["--tyro-print-completion", shell])
@@ -102,7 +99,7 @@ class FrameOptions:
         require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":
-        """Return the choice of frames. Without options, every ``otherwise``-th step is recorded."""
+        """Without options, every ``otherwise``-th step is recorded."""
         from cortado.runs.recording import EverySteps, FramesPerSecond
 
         return EverySteps(self.record_every or otherwise) if self.fps is None else FramesPerSecond(self.fps)
@@ -113,11 +110,7 @@ ALL_FRAMES = FrameOptions()
 
 @dataclass(frozen=True)
 class Where:
-    """The options --scheduler and --workers of a command. Raises `InputError` if both are given, or if there are too
-    many workers."""
-
     scheduler: str | None = None
-    """Address of a Dask scheduler."""
     workers: int | None = None
 
     def __post_init__(self) -> None:
@@ -134,7 +127,6 @@ class Where:
 
     @contextmanager
     def executor(self, device: str, items: int) -> "Iterator[Executor]":
-        """Yield the executor for ``items`` computations: a Dask scheduler, local worker processes, or this process."""
         from cortado.executors import Distributed, InProcess, local_workers
 
         if self.scheduler is not None:
@@ -152,7 +144,6 @@ HERE = Where()
 
 
 def require_shared(out: Path, what: str) -> None:
-    """Raise `InputError` if worker processes cannot access the folder ``out``."""
     if not (out / LOCK).exists():
         raise InputError(f"A worker does not see {out}, but {what} must be in a file system that all machines share.")
 
@@ -168,8 +159,6 @@ def require_one_of_both(resume: bool, overwrite: bool) -> None:
 
 
 def steps_or_time(steps: int | None, time: float | None) -> int | None:
-    """Return the number of steps, which is `STEPS` by default. If a time [s] is given, return None. Raises `InputError`
-    if steps and time are both given."""
     if time is None:
         return STEPS if steps is None else steps
     if steps is not None:
@@ -180,7 +169,6 @@ def steps_or_time(steps: int | None, time: float | None) -> int | None:
 
 
 def text_overrides(file: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the values of --set as text. Raises `SceneError` if the file is unreadable or lacks a key."""
     words = as_text(overrides)
     read_toml(file, words)
     return words

@@ -21,7 +21,6 @@ from cortado.runs.sensor import measured_beside, summary
 from cortado.runs.trajectory import Trajectory
 
 IGNORED = ("command", "started", "resumed", "settings", "kind")
-"""Keys of environment.json that ``cortado compare`` ignores."""
 SAME_TIME = 1e-9
 """Relative difference below which two times count as equal."""
 FIELD_UNITS = {"positions": "m", "velocities": "m/s", "mass_fractions": "-"}
@@ -33,8 +32,7 @@ LEAST_ORDER, MOST_ORDER = 1e-3, 20.0
 LOWEST, HIGHEST = 0.5, 2.0
 """Range of trusted orders of convergence."""
 SAFE, UNSURE = 1.25, 3.0
-"""Safety factors of the estimated error (Roache 1994). The first factor holds for a trusted order of convergence, and
-the second factor for any other case."""
+"""Safety factors of the estimated error for a trusted order of convergence and for any other case (Roache 1994)."""
 
 
 def compare_runs(first: Path, second: Path, as_json: bool) -> str:
@@ -93,7 +91,7 @@ def _metrics(one: RunFolder, other: RunFolder, settings: list[dict[str, Any]], s
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Compare the fields of two runs in their last frames with equal times. Returns None if a run has no frames."""
+    """Compare the fields of two runs in their last frames with equal times."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -165,7 +163,6 @@ def _metric_line(metrics: Mapping[str, Any]) -> str:
 
 
 def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
-    """Compare a run's sensors with measured data, and plot them into the run's figures folder. Returns text or JSON."""
     folder = RunFolder.open(run)
     readings = folder.read_sensors()
     if not readings:
@@ -186,7 +183,6 @@ def compare_with_data(run: Path, data: Path, as_json: bool) -> str:
 
 class Resolved:
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
-        """Read a run and compute the user's ``quantities``. Raises `InputError` if the run failed or has not ended."""
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
             raise InputError(f"{folder.path} is no run that has ended well, but each RUN must be one.")
@@ -221,7 +217,6 @@ class Resolved:
 
 
 def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_json: bool) -> str:
-    """Return the convergence table as text or as JSON. Raises `InputError` for runs that cannot be compared."""
     own = [OwnQuantity(one) for one in quantities]
     runs = [Resolved(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST_RUNS:
@@ -253,8 +248,7 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
 
 
 def _varied(runs: Sequence[Resolved]) -> str:
-    """Return the key of the scene that differs between the runs: the spacing or the time step. Raises `InputError` if
-    other keys differ."""
+    """Return the key of the scene that differs between the runs: the spacing or the time step."""
     changed: set[str] = set()
     for run in runs[1:]:
         changed |= differences(runs[0].scene, run.scene).keys()
@@ -286,20 +280,18 @@ def _convergence_in_words(table: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """The extrapolation of a result to the limit of vanishing spacing or time step. The model for the result f at size
-    h is f(h) = limit + C h^order, with an unknown constant C. The model is fitted to the three finest sizes.
+    """The extrapolation of a result to vanishing spacing or time step. The model f(h) = limit + C h^order of the result
+    f at size h, with an unknown constant C, is fitted to the three finest sizes.
 
     Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911), 307; the grid convergence index of P. J. Roache, J.
     Fluids Eng. 116 (1994), 405; for sizes with different ratios, I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001.
     Without an observed order, the error is three times the greatest difference between the three results: L. Eca and M.
-    Hoekstra, J. Comput. Phys. 262 (2014), 104.
-    """
+    Hoekstra, J. Comput. Phys. 262 (2014), 104."""
 
     order: float | None
     """Observed order of convergence, or None if the values do not converge."""
     limit: float | None
-    """Extrapolated value for vanishing spacing or time step, or None. The extrapolation clips the order to the range
-    from `LOWEST` to `HIGHEST`."""
+    """Extrapolated value, or None. The extrapolation clips the order to the range from `LOWEST` to `HIGHEST`."""
     error: float | None
     """Estimated error of the value at the finest size, including a safety factor. None if a value is NaN."""
     flag: str = ""

@@ -37,8 +37,6 @@ MOST_RUNS = 100_000
 
 @dataclass(frozen=True)
 class Member:
-    """A function that computes one run of a data set in a worker process."""
-
     file: Path
     overrides: tuple[str, ...]
     table: DatasetTable
@@ -67,8 +65,6 @@ class Member:
 
 
 def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str, precision: str, where: Where) -> str:
-    """Compute the missing runs of a data set, write its files, and return a sentence that names the folder. Raises
-    `ComputationError` if the disk is full, or if the training, validation or test set has no runs."""
     table = _table(file, words)
     of_scene = [one for one in words if one not in overrides_of(words, ("dataset",))]
     member = Member(file.absolute(), tuple(of_scene), table, out.absolute(), device, precision)
@@ -133,8 +129,6 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
-    """Write the files of the data set, and return the metadata. Raises `ComputationError` if the training, validation
-    or test set has no runs."""
     folder = DatasetFolder(member.out)
     there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
     for purpose, numbers in split.items():
@@ -160,8 +154,7 @@ def _table(file: Path, overrides: list[str]) -> DatasetTable:
 
 
 def _asked(member: Member) -> dict[str, Any]:
-    """Return the settings that define a data set. To find mistakes early, the scene is read with the least and with the
-    greatest varied values."""
+    """To find mistakes early, the scene is read with the least and with the greatest varied values."""
     table = member.table
     with unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
@@ -189,8 +182,7 @@ def _asked(member: Member) -> dict[str, Any]:
 
 
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
-    """Write the settings of the data set into its folder, and clean the folder. Raises `InputError` if the folder
-    contains unknown files."""
+    """Write the settings of the data set into its folder, and remove unfinished files."""
     note = out / "dataset.json"
     for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
         left_behind.unlink(missing_ok=True)

@@ -50,8 +50,7 @@ SAME = 1e-6
 
 
 def measured_speed(simulation: Simulation) -> tuple[int, float]:
-    """Measure the computing time of some steps. Return the number of steps and the time per step [s]. Raises
-    `DivergedError` if the run diverges."""
+    """Return the number of timed steps and the computing time per step [s]."""
     steps = FIRST_STEPS
     while True:
         rollout = simulation.rollout(steps)
@@ -68,8 +67,6 @@ def measured_speed(simulation: Simulation) -> tuple[int, float]:
 
 
 class RunLength:
-    """The length of a run and of its film."""
-
     def __init__(self, simulation: Simulation, steps: int | None, time: float | None, choice: FrameChoice):
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
@@ -86,14 +83,12 @@ class RunLength:
             size = sum(frame_parts(frames, numbers, simulation.precision.bytes).values())
             self.trajectory = size + (28e3 + 24.0 * simulation.particles + 50.0 * self.steps)  # headers and diagnostics
         self.film: Pace | None = None
-        """Number of frames of the film. None if there is no film, or if its length is unknown."""
         if frames is not None and time is not None and 1 < frames <= 1_000_000 and picture.film_frames != 0:
             times = np.linspace(0.0, time, frames)
             self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
 
 
 def describe_scene(scene_file: Path, asked: RunRequest, picture: Path | None, as_json: bool) -> str:
-    """Describe a scene as text or as JSON. If ``picture`` is a path, a picture of the initial state is drawn there."""
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture is {str(picture)!r}, but must be the name of a PNG file, such as first.png.")
     is_task, steps, time = "optimise" in read_toml(scene_file), asked.steps, asked.time
@@ -176,8 +171,7 @@ def _described(simulation: Simulation, length: RunLength) -> dict[str, Any]:
 
 
 def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | None]:
-    """Return the first time step [s], the limits of the time step [s] by name, and the name of the smallest limit. The
-    name is None for a fixed time step."""
+    """Return the first time step [s], the limits of the time step [s] by name, and the name of the smallest limit."""
     scene = simulation.scene
     if scene.solver.time_step != "auto":
         return scene.solver.time_step, stability_limits(scene), None
@@ -192,8 +186,6 @@ def _time_step(simulation: Simulation) -> tuple[float, dict[str, float], str | N
 
 
 def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
-    """Describe an emitter: the time at which its supply ends, the drains that feed it, its speed, and the areas of its
-    cells and of its opening."""
     dry, areas = emitter.dry_after(spacing), {"area": emitter.area(spacing), "area_asked": emitter.asked_area()}
     known = {"name": emitter.name, "fed_by": list(emitter.fed_by), "speed_m_s": emitter.speed(spacing), **areas}
     return {**known, "runs_dry_at_s": dry if math.isfinite(dry) else None}
@@ -299,8 +291,7 @@ def _time(found: dict[str, Any], length: RunLength) -> str:
 
 
 def _film(length: RunLength, traced: float | None, quick: float | None) -> str:
-    """Describe a film and the time to draw it. ``traced`` and ``quick`` are the drawing times of one picture [s] in two
-    qualities."""
+    """``traced`` and ``quick`` are the drawing times of one picture [s] in two qualities."""
     if length.film is None:
         return "of unknown length; --time says it" if length.time is None else "none"
     if traced is None:
@@ -336,7 +327,6 @@ def check_scene(
     as_json: bool,
     seed: int,
 ) -> str:
-    """Return the certificate of a scene's gradients as text. Raises `ComputationError` if a derivative is wrong."""
     if loss not in ("positions", "centre-of-mass", "image"):
         raise InputError(f"--loss is {shown(loss)}, but must be one of positions, centre-of-mass, image.")
     scene = load_scene(scene_file, overrides).lasting(steps=check_steps(steps))

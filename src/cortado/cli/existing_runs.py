@@ -28,7 +28,6 @@ from cortado.scene.scene import Scene
 from cortado.simulation import Simulation
 
 SWEEP = "sweep.csv"
-"""File name of a sweep's table."""
 
 
 def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
@@ -49,10 +48,8 @@ def named_runs(folders: Sequence[Path]) -> list[RunFolder]:
 
 
 class OwnQuantity:
-    """A user-defined function of a trajectory that returns a number."""
-
     def __init__(self, where: str):
-        """Load the function from ``FILE.py:FUNCTION``. Raises `InputError` if the file fails or lacks the function."""
+        """``where`` is FILE.py:FUNCTION."""
         file, _, name = where.rpartition(":")
         if not file.endswith(".py") or not name.isidentifier():
             raise InputError(f"--quantity is {shown(where)}, but must be FILE.py:FUNCTION.")
@@ -65,7 +62,6 @@ class OwnQuantity:
         self.where, self.name, self._function = where, name, function
 
     def __call__(self, trajectory: Trajectory) -> float:
-        """Return the value for a trajectory. Raises `InputError` if the function fails or returns no number."""
         try:
             found = self._function(trajectory)
             value = np.asarray(found, dtype=np.float64)
@@ -91,7 +87,6 @@ def camera_override(camera: str | None) -> list[str]:
 
 
 def scene_of_run(folder: RunFolder, overrides: list[str]) -> Scene:
-    """Read the scene of an existing run, with overrides of [picture]."""
     for override in overrides:
         if not override.startswith("picture."):
             wanted = "must begin with picture., as the run has been computed already"
@@ -109,7 +104,6 @@ def draw_runs(
     device_name: str,
     settings: Mapping[str, Any],
 ) -> str:
-    """Draw a picture or a film of one run, or of several runs side by side. Returns a sentence that names the file."""
     folders, device = named_runs(runs), device_of(device_name)
     look = scene_of_run(folders[0], overrides)
     others = [scene_of_run(folder, []) for folder in folders[1:]]
@@ -157,7 +151,6 @@ def _trajectory(folder: RunFolder) -> Trajectory:
 
 
 def export_run(run: Path, to: str, out: Path | None, every: int, overrides: list[str]) -> str:
-    """Export every ``every``-th frame of a run in the format ``to``. Returns a sentence that names the files."""
     folder = RunFolder.open(run)
     trajectory, scene = _trajectory(folder)[::every], scene_of_run(folder, overrides)
     found = export(trajectory, folder.path / to if out is None else out, to, scene, lambda: Simulation(scene))

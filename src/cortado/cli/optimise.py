@@ -41,8 +41,7 @@ COUNTED = (
 
 
 def optimise_task(task_file: Path, asked: RunRequest, where: Where = HERE) -> str:
-    """Optimise a task and return a sentence that names the results. ``where`` says which processes compute the samples
-    of ensembles."""
+    """``where`` says which processes compute the samples of ensembles."""
     task = load_task(task_file, asked.overrides)
     if where.option and task.optimise.gradient.samples == 1:
         raise InputError(f"{where.option} is given, but must be left out, as optimise.gradient.samples is 1.")
@@ -62,7 +61,6 @@ def search_settings(task: Task, precision: str) -> dict[str, Any]:
 
 
 def _kept(folder: RunFolder) -> str:
-    """Return a sentence that names the folder of the evaluations, or an empty text before the first evaluation."""
     return f"the evaluations so far are in {folder.checkpoint}" if folder.read_metrics() else ""
 
 
@@ -135,7 +133,6 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
 
 
 def fit_task(task_file: Path, asked: RunRequest) -> str:
-    """Fit the parameters of a task, write the run folder, and return a sentence that names the results."""
     task = load_fit(task_file, asked.overrides)
     experiments = [one.experiment(asked.device, asked.precision) for one in task.experiments]
     with locked(asked.out):

@@ -25,8 +25,6 @@ MOST_ERROR = 0.3
 
 @dataclass(frozen=True)
 class Verdict:
-    """A comparison of the result of an optimisation with the goals in [optimise.check]."""
-
     first: float
     reduction: float
     """First loss divided by the best loss, or infinity if the best loss is 0."""
@@ -40,11 +38,8 @@ class Verdict:
 def judge(
     task: Task, result: Result, estimate: Arrays | None = None, noise: float | None = None, first: float | None = None
 ) -> Verdict:
-    """Compare a result with the goals in the task's [optimise.check].
-
-    ``estimate`` has the found parameters by name, if ``result`` does not have them. ``noise`` is the peak
-    signal-to-noise ratio of the last image [dB]. ``first`` is the initial loss, if the history does not start with it.
-    """
+    """``estimate`` has the found parameters, if ``result`` does not have them. ``noise`` is the peak signal-to-noise
+    ratio of the last image [dB]. ``first`` is the initial loss, if the history does not start with it."""
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf
@@ -86,8 +81,6 @@ def question(made: Setup) -> Section:
 
 
 class Solved:
-    """The result of a finished search and its verdict, as sentences, report and JSON."""
-
     def __init__(self, made: Setup, result: Result):
         self.made, self.result, self.estimate = made, result, made.search.parameters(result.parameters)
         noise = None
@@ -124,7 +117,6 @@ class Solved:
 
     @property
     def advice(self) -> list[str]:
-        """Advice for a small reduction, wrong gradients, a wrong local minimum, or a result on a bound."""
         made, result, task, steps = self.made, self.result, self.made.task, self.made.task.problem.steps
         found = []
         for name, (lower, upper) in made.bounds.items():
@@ -152,8 +144,7 @@ class Solved:
         return found
 
     def _at_knots(self, name: str) -> Iterator[tuple[str, Any, Any, Any]]:
-        """Yield the label, the first guess, the estimate and the true value of a parameter at each knot. An unknown
-        true value is None."""
+        """Yield the label, the first guess, the estimate and the true value (or None) of a parameter at each knot."""
         own = self.knots[name]
         for k, time in enumerate(own.times):
             true = None if own.true is None else own.true[k]
@@ -161,8 +152,7 @@ class Solved:
 
     @property
     def lines(self) -> list[str]:
-        """Lines of text with the estimates of the parameters, or of their values at knots in time. Parameters with very
-        many components are left out."""
+        """Parameters with very many components are left out."""
         lines = []
         for name, value in self.estimate.items():
             found: Iterable[Any] = [(_words(name), None, value, self.made.true_parameter(name))]
@@ -178,7 +168,6 @@ class Solved:
 
     @property
     def rows(self) -> Rows:
-        """Table of the estimates, with the columns parameter, unit, first guess, found, hidden and error."""
         rows, errors, start = Rows(), self.verdict.errors, self.made.search.parameters(self.made.start)
         for name, value in self.estimate.items():
             unit, true = self.made.task.known[name].unit, self.made.true_parameter(name)
@@ -231,7 +220,6 @@ class Solved:
         ]
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the contents of result.json."""
         result, verdict, small = self.result, self.verdict, 1000  # the checkpoint has all of them
         return {
             "evaluations": len(result.history),

@@ -102,11 +102,9 @@ _SENTENCES: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Error parsing (\S+): no type .*\|FLOAT .*? from \[(.*?)\]\. .*", r"\1 is \2, but must be a number"),
     (r"Error parsing (\S+): (.*)", r"\1 cannot be used: \2"),
 )
-"""Patterns of tyro's error messages, with replacements."""
 
 
 def usage_sentence(box: str, arguments: Sequence[str], program: str = "cortado") -> str:
-    """Replace tyro's boxed error message by a sentence."""
     words = " ".join(arguments)
     lines = ["" if set(line) <= set("│|╭╮╰╯─-+ ") else line.strip("│| ") for line in box.splitlines()[1:]]
     text = " ".join(line for line in lines if line)

@@ -31,14 +31,12 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""Least time between two writes of sensor readings and diagnostics [s], and its least ratio to the duration of
-a write."""
+"""Least time between two writes of sensor readings and diagnostics [s], and its least ratio to the duration of a
+write."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """The options of a command for a run, an optimisation or a fit."""
-
     out: Path
     steps: int | None = None
     time: float | None = None
@@ -58,7 +56,6 @@ class RunRequest:
     report: bool = True
 
     def folder(self, scene: Scene, simulation: Simulation, kind: str, settings: dict[str, Any]) -> RunFolder:
-        """Make the folder of the run, or open the folder to resume the run."""
         given = self.out, scene.to_json(), self.command
         noted: dict[str, Any] = {"kind": kind, "settings": settings, "device": str(simulation.device)}
         if self.resume:
@@ -89,10 +86,9 @@ class RunRecording:
     frames: FrameChoice
     watch: Watch
     kept: Trajectory | None = None
-    """Frames that an earlier process recorded, if the run is resumed."""
+    """Frames that an earlier process recorded."""
 
     def go_on(self) -> int:
-        """Continue from the last frame in the folder, and return its step number."""
         if not self.folder.trajectory.exists():
             return 0
         found, begun = Trajectory.load(self.folder.trajectory), self.rollout.clocks[0].steps
@@ -109,7 +105,7 @@ class RunRecording:
         return step
 
     def run(self) -> State:
-        """Take the time steps and return the last state. All results are written before a `DivergedError` is raised."""
+        """All results are written before a `DivergedError` is raised."""
         rollout, steps = self.rollout, self.rollout.steps
         times, first = self.frames.announced(rollout), self.simulation.frame(rollout.initial)
         constants, origin, start = self.simulation.constants(rollout), rollout.origins[0], rollout.clocks[0].time
@@ -159,8 +155,6 @@ class RunRecording:
 
 
 class Notes:
-    """A writer of sensor readings and time step diagnostics at intervals during a run."""
-
     def __init__(self, recording: RunRecording, writer: TrajectoryWriter):
         self._recording, self._writer = recording, writer
         self._step, self._next = recording.rollout.progress.step, time.monotonic() + OFTEN
@@ -184,7 +178,6 @@ class Notes:
 
 
 def run_scene(scene_file: Path, asked: RunRequest) -> str:
-    """Run a scene, write its folder, and return a sentence that names the results."""
     state = None
     if (path := asked.state) is not None:
         file = RunFolder.open(path, ", but --state must be the folder of one").trajectory if path.is_dir() else path
@@ -242,7 +235,6 @@ def _compute(recording: RunRecording, asked: RunRequest) -> None:
 
 
 def _for_machines(simulation: Simulation, rollout: Rollout) -> dict[str, Any]:
-    """Return the mean and the maximum of each diagnostic over all time steps, by name."""
     noted = {name: np.asarray(values, dtype=np.float64) for name, values in rollout.diagnostics.items() if len(values)}
     return {
         "particles": simulation.particles,

@@ -39,8 +39,7 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of the fluid [J], without particles in emitters and drains. In 2-D the energies are for a layer 1 m
-    thick."""
+    """Energies of the fluid [J], in 2-D of a layer 1 m thick. Particles in emitters and drains are left out."""
 
     kinetic: float
     potential: float
@@ -69,7 +68,7 @@ class RunSummary:
     def __init__(
         self, simulation: Simulation, rollout: Rollout, last: State, seconds: float, readings: Mapping[str, Readings]
     ):
-        """Summarise a run from its last state, the computing time of this process [s], and the sensor readings."""
+        """``seconds`` is the computing time of this process."""
         solver, taken, gravity = rollout.solver, rollout.taken, rollout.parameters["gravity"].numpy()
         self.steps, self.seconds, self.readings = taken, seconds, readings
         self.computed = taken - rollout.progress.step  # without the steps of an earlier process
@@ -99,7 +98,6 @@ class RunSummary:
         return 1e3 * self.seconds / max(self.computed, 1)
 
     def for_machines(self) -> dict[str, Any]:
-        """Return the reproducible results of the run, by name."""
         least, greatest = self.densities or (None, None)
         return {
             "energy": {"first": vars(self.first), "last": vars(self.last)},
@@ -184,8 +182,7 @@ def write_run_report(
     pictures: bool,
     read: Mapping[str, Readings] | None = None,
 ) -> None:
-    """Write the report of a run. ``told`` is the section with the results, and ``read`` has the readings by sensor. If
-    ``pictures`` is true, the report shows shaded pictures."""
+    """``told`` is the section with the results of the run."""
     scene, trajectory, step = simulation.scene, Trajectory.load(folder.trajectory), float(rollout.time_steps[0])
     length = f"{rollout.steps} steps of {step:g} s, {rollout.steps * step:.4g} s of fluid"
     if scene.solver.chooses:

@@ -209,7 +209,6 @@ def view(
 
 
 def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:
-    """Raise `InputError` if --set replaces one of the ``keys`` of [picture]."""
     for override in overrides:
         name = override.partition("=")[0].strip()
         if name.removeprefix("picture.") in keys:

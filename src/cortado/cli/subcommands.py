@@ -297,7 +297,6 @@ COMMANDS = [command for group in _GROUPS.values() for command, _ in group]
 
 
 def overview() -> str:
-    """Return the text that ``cortado`` prints without arguments."""
     lines = [f"Cortado {__version__}, a differentiable SPH fluid simulator."]
     for title, entries in _GROUPS.items():
         lines += ["", f"{title}:"]
@@ -318,7 +317,6 @@ SCENE_FILE, SCENE_NAME = "SCENE.toml", 'name = "SCENE"'
 """Placeholders in a template for the file name and for the line with the scene's name."""
 ALL = "all"
 DATA = (".csv", ".mp4")
-"""Suffixes of the data files of an example."""
 
 
 def templates() -> list[str]:
@@ -326,7 +324,7 @@ def templates() -> list[str]:
 
 
 def new_scene(path: Path, template: str, dimension: int | None) -> str:
-    """Write a scene file, and the schema for editors beside it. Existing files are not replaced."""
+    """Existing files are not replaced."""
     if template not in templates():
         raise InputError(f"--template is {shown(template)}, but must be one of {', '.join(templates())}.")
     if dimension is not None and template != DAM:
@@ -356,8 +354,7 @@ def scene_text(file: Path, template: str) -> tuple[str, str]:
 
 
 def list_examples(names: list[str], folder: Path) -> str:
-    """List the examples, one per line, or copy the named examples and their data files into a folder. Nothing is copied
-    if one of the files exists already."""
+    """Nothing is copied if one of the files exists already."""
     found = {path.stem: path for path in sorted(examples_folder().iterdir()) if path.suffix in (".toml", ".py")}
     if not found:
         raise InputError(f"{examples_folder()} holds no examples: install Cortado again.")

@@ -32,8 +32,6 @@ _LONGEST_NAME = 120
 
 @dataclass(frozen=True)
 class Combination:
-    """One value for each key of a sweep."""
-
     values: tuple[tuple[str, str], ...]
     """Pairs of key and value, as the user wrote them."""
 
@@ -43,8 +41,7 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """Name of the combination's folder, made of the values. A long or special name is shortened and ends with a
-        checksum."""
+        """Name of the combination's folder. A long or special name is shortened and ends with a checksum."""
         name = ",".join(self.overrides)
         is_plain = re.fullmatch(r"[A-Za-z0-9_=,.+-]+", name) and not name.startswith(("-", "."))  # needs no quotes
         if is_plain and len(name) <= _LONGEST_NAME:
@@ -101,8 +98,7 @@ def _split(text: str) -> list[str]:
 
 
 def write_table(folder: Path, combinations: Sequence[Combination], results: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the table of a sweep, with the folder, the values and the results of each combination. ``results`` has the
-    contents of result.json by combination number."""
+    """``results`` has the contents of result.json by combination number."""
     rows = list[dict[str, Any]]()
     for number, result in sorted(results.items()):
         one, failures = combinations[number], result["failures"]
@@ -118,8 +114,7 @@ def write_table(folder: Path, combinations: Sequence[Combination], results: Mapp
 
 
 def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Flatten nested dicts, and join their keys with full stops. Short lists become JSON text, and long lists are left
-    out."""
+    """Join the keys of nested dicts with full stops. Short lists become JSON text, and long lists are left out."""
     found: dict[str, Any] = {}
     for name, value in result.items():
         if isinstance(value, Mapping):
@@ -133,18 +128,13 @@ def _flat(result: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Member:
-    """A function that computes one combination of a sweep in a worker process."""
-
     file: Path
     duration: float | None
     """Duration of a scene's run [s], or None for a task."""
     asked: RunRequest
-    """Options that all runs share, including the folder of the sweep."""
     frames: FrameOptions
-    """Choice of recorded frames. The default is about a hundred frames."""
 
     def __call__(self, combination: Combination) -> dict[str, Any]:
-        """Return the contents of a combination's result.json. Missing results are computed first."""
         require_shared(self.asked.out, "the task and the folder of a sweep")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -155,8 +145,7 @@ class Member:
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
-        """Return the result of a combination, or None if its run has not ended. Raises `InputError` if the scene or
-        task is wrong, or differs from the scene or task in the folder."""
+        """Return the result of a combination, or None if its run has not ended."""
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)
@@ -207,8 +196,6 @@ class Member:
 def run_sweep(
     file: Path, options: list[str], zipped: list[str], asked: RunRequest, frames: FrameOptions, where: Where
 ) -> str:
-    """Compute the missing combinations of a sweep, and return a summary in words. Raises `ComputationError` if some
-    fail."""
     chosen, duration, out = combinations(options, zipped), asked.time, asked.out.absolute()
     if "optimise" in read_toml(file):  # a task
         own: dict[str, Any] = {"steps": asked.steps, "time": asked.time, "no-pictures": None if asked.report else True}

@@ -118,7 +118,6 @@ class GuardedServer:
         return serve(*where, **options | own)
 
     def _answer(self, answer: Answer | None, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request. Requests without the token, with another host name, or from a foreign page are refused."""
         token, _, rest = request.path.removeprefix("/").partition("?")[0].partition("/")
         own, port = compare_digest(token.encode(errors="replace"), self._token.encode()), connection.local_address[1]
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
@@ -146,7 +145,6 @@ def judged(message: bytes | str, controls: Controls) -> bytes | None:
 
 
 def _can_be(said: Update, controls: Controls) -> bool:
-    """Test whether a user of the page could set a control to the value in the message."""
     control, value = controls(said.uuid), said.updates["value"]
     if control is None or control.disabled or not control.visible:
         return False

@@ -38,7 +38,7 @@ PALETTE = "viridis"
 LINES = (130, 125, 118)
 THIN: Any = {"thickness": 1.5, "thickness_units": "screen"}
 Quantity = Callable[[], np.ndarray]
-"""A function that computes a quantity (n,) of the particles. It may raise a `CortadoError`."""
+"""A function that returns a quantity (n,) of the particles, or raises a `CortadoError`."""
 
 
 class Window:
@@ -82,13 +82,8 @@ class Window:
                 self.server.scene.add_mesh_simple(f"{name}/faces", *mesh, **look)
 
     def show(self, positions: Points, colours: Points, out: NDArray, quantities: Mapping[str, Quantity]) -> None:
-        """Draw the particles that are marked in the mask ``out`` (n,), instead of the previous particles.
-
-        Args:
-            positions: (n, d) [m]. Along a periodic axis particles are drawn within one period.
-            colours: (n, 3), linear.
-            quantities: functions by name, which return values (n,) to colour the particles.
-        """
+        """Draw the particles in the mask ``out`` (n,), with linear ``colours`` (n, 3). Along a periodic axis particles
+        are drawn within one period. The functions ``quantities`` return values (n,) for other colours."""
         self._drawn = np.where(out, np.arange(len(out)), np.argmax(out))  # hidden particles are drawn where one is
         self._points = self._space(self.scene.domain.wrapped(positions)[self._drawn])
         self._own_colours, self._quantities = to_srgb(colours[self._drawn][None])[0], quantities
@@ -170,8 +165,7 @@ def _scale(name: str, unit: str, least: float, greatest: float, clips: bool) -> 
 def quantities_of(
     velocities: np.ndarray, simulation: Callable[[], Simulation], state: RestartState, controls: Mapping[str, Any]
 ) -> dict[str, Quantity]:
-    """Return functions that compute particle quantities of a state, by name. ``velocities`` has the shape (n, d) [m/s].
-    The functions may raise `InputError`, except the function of the speed."""
+    """Return functions of particle quantities by name. ``velocities`` has the shape (n, d) [m/s]."""
 
     def density() -> np.ndarray:
         rollout = simulation().rollout(1, controls, state)

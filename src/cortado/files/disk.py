@@ -33,8 +33,7 @@ OTHERS = (
 
 
 def as_path(what: str, value: Any) -> str:
-    """Return a path as text. Raises `InputError` for any other type. Numbers are errors too, because Python interprets
-    them as open files."""
+    """Raises `InputError` also for a number, because Python interprets a number as an open file."""
     if isinstance(value, (str, os.PathLike)):
         path = os.fspath(value)
         if isinstance(path, str) and path:
@@ -43,8 +42,7 @@ def as_path(what: str, value: Any) -> str:
 
 
 def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
-    """Return the size and times of a file. Raises `OSError` if the file is not regular or is larger than ``most``
-    bytes."""
+    """Raises `OSError` unless the file is regular and has at most ``most`` bytes."""
     try:
         found = os.stat(path)
     except ValueError:  # a character that no name has
@@ -57,9 +55,8 @@ def regular_file(path: str | os.PathLike[str], most: int) -> os.stat_result:
 
 
 def cached_by_file(kept: int, most: int) -> Callable[[Callable[..., Found]], Callable[..., Found]]:
-    """Return a decorator for functions of a file's path. The decorator caches the last results of a function until the
-    file changes. The decorated function raises `InputError` if the file is not regular or is larger than ``most``
-    bytes."""
+    """Return a decorator that caches the last ``kept`` results of a function of a path until the file changes. The
+    decorated function raises `InputError` unless the file is regular and has at most ``most`` bytes."""
 
     def decorated(read: Callable[..., Found]) -> Callable[..., Found]:
         known = lru_cache(kept)(lambda version, path, *more: read(path, *more))
@@ -99,8 +96,7 @@ MOST_BYTES = 2**28
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. An empty cell is NaN.
-    Raises `InputError` if the file is not a valid table."""
+    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. An empty cell is NaN."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]
@@ -151,14 +147,12 @@ _REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def unfinished(path: Path) -> Path:
-    """Return an unpredictable temporary name in the folder of `path`. Open the file with mode "x", which follows no
-    links."""
+    """Return an unpredictable name in the same folder. Open the file with mode "x", which follows no links."""
     return path.with_name(UNFINISHED.replace("*", secrets.token_hex(8)))
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file under a temporary name and rename it. Readers never see an incomplete file. Raises
-    `ComputationError` if the disk is full, and `InputError` if the path cannot be written."""
+    """Write a file under a temporary name and rename it, so that readers never see an incomplete file."""
     temporary = unfinished(path)
     with sentences(path):
         if path.exists() and not path.is_file() and not path.is_dir():
@@ -174,7 +168,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Test whether a path exists. A broken link also counts as existing. Raises `InputError` if the test fails."""
+    """A broken link counts as existing."""
     with sentences(path):
         try:
             path.lstat()
@@ -191,7 +185,7 @@ def write_fully(file: Any, content: bytes) -> None:
 
 
 def parsed_json(text: bytes) -> Any:
-    """Return the value of a JSON text. Raises `ValueError` for wrong JSON or excessive nesting."""
+    """Raises `ValueError` also for excessive nesting."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -200,8 +194,7 @@ def parsed_json(text: bytes) -> Any:
 
 @contextmanager
 def sentences(path: Path) -> Iterator[None]:
-    """Replace an `OSError` by an error with a clear message. The error is `ComputationError` for a full or broken disk,
-    and `InputError` otherwise."""
+    """Turn an `OSError` into a `ComputationError` for a full or broken disk, and otherwise into an `InputError`."""
     try:
         yield
     except OSError as problem:
@@ -245,8 +238,7 @@ _NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Create a folder and lock it against other processes. Raises `InputError` if another process holds the lock. Some
-    network drives have no locks."""
+    """Create a folder and lock it against other processes. A network drive without locks is accepted."""
     path = folder / LOCK
     with sentences(folder):
         folder.mkdir(parents=True, exist_ok=True)

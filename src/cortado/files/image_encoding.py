@@ -22,15 +22,13 @@ from cortado.files.terminal import held
 
 ROWS = 32
 MOST_LIGHT = 2.0
-"""Greatest value in a linear picture from a user. Pictures with larger values probably contain byte values from 0 to
-255."""
+"""A larger value in a user's linear picture probably means that the picture has byte values from 0 to 255."""
 STEPS = 1 << 14
 """Number of intervals of linear light from 0 to 1. Each interval contains at most one boundary between byte values."""
 LIGHT = "linear light from 0 to 1, as that of cortado.pictures.read_picture"
 
 
 def check_light(what: str, image: ArrayLike) -> None:
-    """Raise `InputError` if a picture contains byte values up to 255. The error message begins with ``what``."""
     if np.asarray(image).dtype.kind in "iu":
         raise InputError(f"{what} is made of whole numbers, but must be {LIGHT}.")
     light = as_numbers(what, image)
@@ -40,9 +38,8 @@ def check_light(what: str, image: ArrayLike) -> None:
 
 
 def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArray[np.uint8]:
-    """Return the sRGB bytes of a linear image (rows, columns, 3). Light is clipped to the range from 0 to 1. ``each``
-    is a function like `map`, which is used for the parts of the image. Raises `InputError` for a wrong shape and for
-    values that are not finite."""
+    """Return the sRGB bytes of a linear image (rows, columns, 3), clipped to the range from 0 to 1. ``each`` is a
+    function like `map`, which may convert parts of the image in parallel."""
     light = image if isinstance(image, np.ndarray) and image.dtype == np.float32 else as_numbers("The image", image)
     if light.ndim != 3 or light.shape[2] != 3 or not light.size:
         raise InputError(f"The image has shape {light.shape}, but must be (rows, columns, 3).")
@@ -57,7 +54,6 @@ def to_srgb(image: ArrayLike, each: Callable[..., Iterable[Any]] = map) -> NDArr
 
 
 def srgb_bytes(light: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the sRGB bytes of linear light. Light is clipped to the range from 0 to 1."""
     if not np.isfinite(light).all():
         raise InputError("The image has values that are not finite; check how it was computed.")
     light = np.clip(light, light.dtype.type(0.0), light.dtype.type(1.0))
@@ -85,8 +81,7 @@ def from_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def png(image: ArrayLike) -> bytes:
-    """Return an 8-bit sRGB PNG file of a linear image (rows, columns, 3). Light is clipped to the range from 0 to 1.
-    Raises the same errors as `to_srgb` and `check_light`."""
+    """Return an 8-bit sRGB PNG file of a linear image (rows, columns, 3)."""
     from PIL import Image
 
     pixels, content = to_srgb(image), BytesIO()
@@ -104,7 +99,6 @@ class ShadedPicture(np.ndarray):
         return np.asarray(image).view(cls)
 
     def _repr_png_(self) -> bytes | None:
-        """Return the picture as PNG bytes, or None if the array has not the shape of a picture."""
         return png(self) if self.ndim == 3 and self.shape[2] == 3 else None
 
 
@@ -117,8 +111,6 @@ TICKS = 90_000
 
 
 class Video:
-    """A video file to which frames are added. Use `writing` to open a video file."""
-
     def __init__(self, container: Any, frames_per_second: float):
         from av.video.reformatter import VideoReformatter
 
@@ -129,8 +121,7 @@ class Video:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame that is shown from ``time`` [s] on. If the number of rows or columns is odd, the last row or
-        column is repeated."""
+        """Add a frame that is shown from ``time`` [s] on. The last row or column of an odd number is repeated."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)
@@ -185,21 +176,11 @@ class Video:
 
 @contextmanager
 def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
-    """Open a video for writing. The file appears under its path at the end of the ``with`` block.
+    """Open a video, which appears under its path at the end of the ``with`` block. After an interruption the next call
+    with the same ``note`` and ``count`` continues after the finished frames.
 
-    After an interruption the file contains the finished frames. The next call with the same ``note`` and ``count``
-    continues after the finished frames.
-
-    Args:
-        path: path of the file, which ends in .mp4.
-        frames_per_second: approximate frame rate. The exact time of each frame is stored.
-        note: text that identifies the content; it is stored in the file.
-        count: number of frames of the complete video.
-
-    Raises:
-        InputError: PyAV is missing, there are no frames or frames of several sizes, or the file cannot be written.
-        ComputationError: the disk is full.
-    """
+    ``count`` is the number of frames of the complete video. ``note`` is a text about the content, stored in the file.
+    ``frames_per_second`` is approximate: the file stores the exact time of each frame."""
     av, path = pyav(), Path(path)
     if path.suffix.lower() != ".mp4":
         raise InputError(f"The film {path} must end in .mp4, or in .webp.")
@@ -229,8 +210,7 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
 
 
 def write_video(path: str | Path, frames: Iterable[ArrayLike], frames_per_second: float = 25.0) -> Path:
-    """Write a video of linear images (rows, columns, 3), and return its path. All images must have the same size.
-    Raises the same errors as `writing`."""
+    """Write a video of linear images (rows, columns, 3) of the same size."""
     with writing(path, frames_per_second) as video:
         for k, frame in enumerate(frames):
             video.add(frame, k / frames_per_second)
@@ -279,7 +259,7 @@ class Animation:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a linear image (rows, columns, 3) that is shown from ``time`` [s] on."""
+        """The linear image (rows, columns, 3) is shown from ``time`` [s] on."""
         self._images.append(to_srgb(image))
         self._times.append(time)
         self.frames += 1
@@ -298,8 +278,8 @@ class Animation:
 
 @contextmanager
 def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[Video | Animation]:
-    """Open a film for writing. The film is an animated WebP if the path ends in .webp, or else a video. An animation is
-    written at the end of the ``with`` block, even after an interruption."""
+    """Open an animated WebP if the path ends in .webp, or else a video. An animation is written at the end of the
+    ``with`` block, even after an interruption."""
     if path.suffix.lower() != ".webp":
         with writing(path, frames_per_second, note, count) as video:
             yield video

@@ -75,8 +75,7 @@ def tell(result: str) -> None:
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """Convert errors of printing: a closed pipe raises `BrokenPipeError`, and any other error raises
-    `ComputationError`."""
+    """A closed pipe raises `BrokenPipeError`. Any other error of printing raises `ComputationError`."""
     try:
         try:
             yield
@@ -135,15 +134,13 @@ def announce(result: str) -> None:
 
 
 Advance = Callable[..., None]
-"""A function that reports ``n`` finished steps, by default one step. Further arguments are values to show, such as
-``loss=0.1``."""
+"""A function that reports ``n`` finished steps, by default one step, with values to show such as ``loss=0.1``."""
 
 _hidden: ContextVar[bool] = ContextVar("hidden", default=False)
 
 
 @contextmanager
 def untracked() -> Iterator[None]:
-    """Hide the progress of parts of a larger computation."""
     token = _hidden.set(True)
     try:
         yield
@@ -185,8 +182,7 @@ def _bar(total: int, description: str, stream: TextIO) -> Iterator[Advance]:
 
 
 class _Lines:
-    """Progress as lines of text. The estimate of the remaining time ignores the time before the first report, when
-    kernels are compiled."""
+    """The estimate of the remaining time ignores the time before the first report, when kernels are compiled."""
 
     def __init__(self, total: int, description: str, stream: TextIO, interval: float) -> None:
         self._total, self._description, self._stream, self._interval = total, description, stream, interval
@@ -222,7 +218,6 @@ AGAIN = 0.01
 """Delay before an interruption is raised again [s], in case Python ignored the exception."""
 
 _stderr = 2
-"""File descriptor of a copy of stderr."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -272,8 +267,7 @@ def keeping(kept: Callable[[], str]) -> Iterator[None]:
 
 
 class Hold:
-    """A temporary delay of signals. Threads and processes that start during the delay never receive the Ctrl-C of a
-    terminal."""
+    """Threads and processes that start while signals are delayed never receive the Ctrl-C of a terminal."""
 
     def __init__(self) -> None:
         self._late: list[int] = []
@@ -287,7 +281,6 @@ class Hold:
             self._handler = signal.signal(signal.SIGTERM, lambda number, _: self._late.append(number))
 
     def end(self) -> None:
-        """Deliver the delayed signals. Later calls do nothing."""
         if self._handler is not None:
             signal.signal(signal.SIGTERM, self._handler)
             self._handler = None
@@ -315,8 +308,7 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """Return the last part of an interruption's message. If an earlier interruption was being handled, the message of
-    the earlier one is used."""
+    """Return the text of the interruption that was handled first."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

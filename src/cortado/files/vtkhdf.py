@@ -58,8 +58,7 @@ class FileLayout:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     origin: str = ""
     marks: tuple[float, ...] = ()
-    """Time of the first frame [s] and frames per second [1/s]. The tuple is empty if frames are chosen by number of
-    steps."""
+    """Time of the first frame [s] and frames per second [1/s]. Empty if frames are chosen by number of steps."""
 
     def __post_init__(self) -> None:
         own: dict[str, Any] = {"times": np.array(self.times, dtype=np.float64, ndmin=1)}
@@ -85,8 +84,7 @@ class FileLayout:
 
     @property
     def rows(self) -> dict[str, tuple[int, ...]]:
-        """Shape of one particle's values in each dataset, by the dataset's name. The datasets are in the order of the
-        checksum."""
+        """Shape of one particle's values by the dataset's name, in the order of the checksum."""
         fields: dict[str, tuple[int, ...]] = dict.fromkeys(("velocity", *self.vectors), (3,))
         fields |= dict.fromkeys(self.scalars, ())
         return {"VTKHDF/Points": (3,)} | {f"VTKHDF/PointData/{name}": fields[name] for name in sorted(fields)}
@@ -168,8 +166,7 @@ class FileLayout:
 
 
 def frames_seed(shape: tuple[int, int], kinds: Kinds, constants: Arrays, origin: str, marks: tuple[float, ...]) -> int:
-    """Return the initial checksum, before any frame. The checksum depends on the types and shapes of the fields and on
-    the constants."""
+    """Return the checksum of the fields' types and shapes and of the constants, before any frame."""
     fixed = [(name, array.dtype.str, array.shape, array.tobytes()) for name, array in sorted(constants.items())]
     varying = [(name, dtype.str, sizes) for name, (dtype, sizes) in kinds.items()]
     return zlib.crc32(origin.encode(), zlib.crc32(repr((shape, varying, fixed, *marks)).encode()))
@@ -203,7 +200,7 @@ class Pages(io.RawIOBase):
         self._place = self._end = 0
 
     def save(self, file: Any) -> None:
-        """Write the pages to an open file on disk. The file remains sparse."""
+        """The file remains sparse."""
         file.truncate(self._end)
         for number, page in sorted(self._pages.items()):
             file.seek(number * _PAGE)
@@ -245,9 +242,8 @@ class TrajectoryWriter:
     frames, and can be opened while it grows. Missing frames contain no particles."""
 
     def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
-        """Create the file. ``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames,
-        by default for all frames. Raises `InputError` for impossible sizes or paths, and `ComputationError` if the disk
-        is too full."""
+        """``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames, or else for
+        all."""
         self.path, self._layout = Path(path), FileLayout(**fields)
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)
@@ -279,9 +275,8 @@ class TrajectoryWriter:
         **scalars: ArrayLike,
     ) -> None:
         """Write one frame: positions (n, d) [m], velocities (n, d) [m/s], and the fields named at construction.
-        ``step`` is the number of steps so far, by default the number of frames. ``time`` [s] replaces the expected
-        time. Raises `InputError` for wrong shapes or names and for too many frames, and `ComputationError` if the disk
-        is full. Earlier frames remain readable."""
+        ``step`` is by default the number of frames. ``time`` [s] replaces the expected time. Earlier frames remain
+        readable after an error."""
         frame, frames = self.frames_written, len(self._layout.times)
         if frame >= frames:
             raise InputError(f"{self.path} has room for {frames} frames, but one more was given.")
@@ -313,8 +308,7 @@ class TrajectoryWriter:
         self.frames_written, self._frames_checksum = frame + 1, checksum
 
     def append_steps(self, **diagnostics: ArrayLike) -> None:
-        """Write the diagnostics of one step (scalars) or of k steps (arrays (k,)), by name. Raises the same errors as
-        `append`."""
+        """Write the diagnostics of one step (scalars) or of k steps (arrays (k,)), by name."""
         kinds = self._layout.diagnostics
         if set(diagnostics) != set(kinds):
             raise InputError(f"Expected the diagnostics {sorted(kinds)}, found {sorted(diagnostics)}.")
@@ -362,17 +356,13 @@ class TrajectoryWriter:
 
 
 def read(path: str | Path) -> dict[str, Any]:
-    """Read the complete frames and steps, also during a run and after a killed run.
+    """Read the complete frames and steps, also during a run and after a killed run. Raises `InputError` if the file is
+    missing, damaged, or not a trajectory of Cortado.
 
-    Returns:
-        A table with times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d)
-        [m/s], and every scalar field (frames, n). The keys others, constants and diagnostics have tables of arrays by
-        name. The arrays in others are of every frame, in constants of the run, and in diagnostics of every step
-        (steps,). The key origin has a text. The key marks has None or two numbers.
-
-    Raises:
-        InputError: the file is missing, damaged, or not a trajectory of Cortado.
-    """
+    The result has times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
+    and every scalar field (frames, n). The keys others, constants and diagnostics have tables of arrays by name: others
+    for every frame, constants of the run, and diagnostics for every step (steps,). The key origin has a text, and marks
+    has None or two numbers."""
     import h5py
 
     if not Path(path).is_file():

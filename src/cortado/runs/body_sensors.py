@@ -41,8 +41,7 @@ def six_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 class SpringLoads:
-    """The force and the length of a spring at the start of a time step. Both are stored as the first two components of
-    a load."""
+    """A load whose components are the force and the length of the spring at the start of a time step."""
 
     def __init__(self, springs: Springs, spring: Ends):
         layout, self._springs, self._spring = springs.layout, springs, spring

@@ -59,13 +59,13 @@ class Marks:
         return self.start + np.asarray(numbers) / self.rate
 
     def due(self, times: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the due times (frames,) [s] of frames at ``times`` (frames,) [s], or ``times`` after skipped ones."""
+        """Return due times (frames,) [s] of frames at ``times`` (frames,) [s]. A frame after a gap keeps its time."""
         numbers = self.passed(times)
         one_by_one = np.diff(numbers, prepend=numbers[:1] - 1) == 1
         return np.where(one_by_one, self.at(numbers), times)
 
     def chosen(self, times: NDArray[Any], stride: int) -> Marks | None:
-        """Return the due times of every ``stride``-th frame, or None if the chosen frames are not evenly spaced."""
+        """Return None if every ``stride``-th frame is not evenly spaced."""
         numbers = self.passed(times)
         apart = np.diff(numbers)
         every = 1 if stride == 1 else int(apart[0]) if len(apart) else 0
@@ -75,7 +75,7 @@ class Marks:
 
 
 def common_rate(each: Iterable[Marks | None]) -> float | None:
-    """Return the common frame rate [1/s] of runs, or None if they have no common rate."""
+    """Return the frame rate [1/s] of the runs, or None if the rates differ."""
     rates = {None if marks is None else marks.rate for marks in each}
     return rates.pop() if len(rates) == 1 else None
 
@@ -83,8 +83,7 @@ def common_rate(each: Iterable[Marks | None]) -> float | None:
 def frame_writer(
     path: str | Path, first: Fields, diagnostics: Fields, origin: Origin | None, marks: Marks | None, **layout: Any
 ) -> vtkhdf.TrajectoryWriter:
-    """Open a trajectory file for frames with the fields of ``first``. ``layout`` has the names of the ``quantities``,
-    and further arguments of `TrajectoryWriter`."""
+    """Open a trajectory file for frames like ``first``. ``layout`` has further arguments of `TrajectoryWriter`."""
     quantities = layout.pop("quantities")
     particles, dimension = first["positions"].shape[-2:]
     single = first["positions"].dtype == np.float32
@@ -108,7 +107,7 @@ def frame_writer(
 def append_frame(
     writer: vtkhdf.TrajectoryWriter, frame: Fields, step: int, quantities: Fields, time: float | None = None
 ) -> None:
-    """Write the frame after ``step`` steps, at ``time`` [s] or at the time that `frame_writer` was given."""
+    """Write a frame. Without ``time`` [s], the frame has the time that `frame_writer` was given."""
     fractions = frame["mass_fractions"].T if "mass_fractions" in frame else ()
     scalars = {**dict(zip(fraction_names(len(fractions)), fractions, strict=True)), **quantities}
     writer.append(frame["positions"], frame["velocities"], step=step, time=time, others=_others(frame), **scalars)
@@ -124,8 +123,6 @@ def fraction_names(phases: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Pace:
-    """The chosen frames of a film, and their times in the film."""
-
     frames: tuple[int, ...]
     times: tuple[float, ...]
     speed: float
@@ -135,15 +132,11 @@ class Pace:
     """Frames per simulated second that give `USUAL` frames per second of the film [1/s]."""
     is_asked: bool
     of_search: bool = False
-    """True for the film of a search."""
 
     @classmethod
     def of(cls, times: Times, count: int | None = None, speed: float | None = None, rate: float | None = None) -> Pace:
-        """Choose at most ``count`` frames from frames at ``times`` [s].
-
-        The default ``speed`` is real time, unless the film would be too short or too long. With the recorded frame
-        ``rate`` [1/s] the film shows every k-th frame.
-        """
+        """Choose at most ``count`` frames. The default ``speed`` is real time, unless the film would be too short or
+        too long. With the recorded frame ``rate`` [1/s] the film shows every k-th frame."""
         span = float(times[-1] - times[0])
         full, is_asked = speed or _easy_speed(span), speed is not None
         if speed is None and span <= 0.0:
@@ -208,7 +201,6 @@ class Film:
 
 
 def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
-    """Return the pace for frames at ``times`` [s] from [picture]. Warn if it asks for more frames than there are."""
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
@@ -272,8 +264,7 @@ class SolidMotion:
         return replace(self, positions=places, rotations=rotations)
 
     def between(self, known: NDArray[Any], times: NDArray[Any], table: SolidTable) -> Self:
-        """Return the motion at ``times`` (k,) [s], interpolated between frames at the times ``known`` (frames,) [s].
-        ``table`` has the path of the solid."""
+        """Interpolate the motion between frames at ``known`` (frames,) [s], for ``times`` (k,) [s]."""
         shift, turn = courses(table)
         kept = self.positions - shift.at(known)
         places = np.stack([np.interp(times, known, x) for x in kept.T], axis=1) + shift.at(times)
@@ -288,11 +279,11 @@ class SolidMotion:
 
 
 class SolidMotions(dict[str, SolidMotion]):
-    """Motions of solids by name. An unknown name raises `InputError`."""
+    """An unknown name raises `InputError`."""
 
     @classmethod
     def of(cls, fields: Mapping[str, NDArray[Any]], dimension: int) -> SolidMotions:
-        """Return the motions of all solids in recorded fields (frames, 1, ...)."""
+        """The recorded fields have the shape (frames, 1, ...)."""
         return cls({name: SolidMotion.of(name, fields, dimension) for name in solids_in(fields)})
 
     def __missing__(self, name: object) -> SolidMotion:
@@ -300,8 +291,7 @@ class SolidMotions(dict[str, SolidMotion]):
         raise InputError(f"solids has no {shown(name)}, as the run {known}.")
 
     def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> SolidMotions:
-        """Return the motions at ``times`` (k,) [s], interpolated between frames at the times ``known`` (frames,) [s].
-        ``recorded`` (k,) are the numbers of the nearest frames."""
+        """``recorded`` (k,) are the numbers of the frames nearest to ``times`` (k,) [s]."""
         shifts, tables = times - known[recorded], {table.name: table for table in told(scene.solid)}
         if not shifts.any():
             return SolidMotions({name: motion[recorded] for name, motion in self.items()})

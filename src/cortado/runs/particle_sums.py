@@ -37,7 +37,6 @@ class Ride:
     turns: bool
 
     def table(self, at: SensedScene) -> SolidTable:
-        """Return the table of the solid. Raises `InputError` unless the solid moves."""
         moving = {table.name: table for table in at.solids if table.moves}
         if self.on not in moving:
             names = f", of {', '.join(map(shown, moving))}" if moving else "; the scene has none"
@@ -110,7 +109,6 @@ def together(*each: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def axes_of(axes: Any, is_carried: bool) -> Axes:
-    """Return the axes of a sensor, "world" or "body". Raises `InputError` for others, or "body" without a solid."""
     if not isinstance(axes, str) or axes not in ("world", "body"):
         raise InputError(f'axes is {shown(axes)}, but must be "world" or "body".')
     if axes == "body" and not is_carried:
@@ -136,7 +134,7 @@ class Around:
     """Positions of the parts of a particle relative to the particle (m, d) [m], or None for an undivided particle."""
 
     def carried(self, carrier: Carrier, turns: bool) -> "Around":
-        """Return the place moved by a solid. With ``turns``, the axes of the sensor rotate with the solid."""
+        """With ``turns``, the axes of the sensor rotate with the solid."""
         place, turn = carrier.place(self.place), carrier.flat
         if not turns:
             return replace(self, place=place)
@@ -150,8 +148,7 @@ class Around:
 
 @dataclass(frozen=True)
 class Image:
-    """Weights of the particles near a sensor, for one periodic image. Particles may be divided into parts; the weights
-    are then for one part of each particle."""
+    """Weights of the particles, or of one part of each particle, near one periodic image of a sensor."""
 
     near: NDArray[np.int_]
     ways: NDArray[Any]
@@ -209,10 +206,7 @@ def reach_of(given: float | None, at: Cut) -> float:
 
 
 def parts_of(reach: float, at: Cut, across: Across, axes: int) -> NDArray[Any]:
-    """Return the positions (m, d) [m] of the parts of a particle relative to the particle.
-
-    Particles are divided along ``axes`` axes, so that the weights on the rest lattice add up to 1.
-    """
+    """Return the positions (m, d) [m] of a particle's parts relative to the particle, divided along ``axes`` axes."""
     spacing = at.lattice.cell ** (1.0 / at.dimension)
     count = min(int(np.ceil(LEAST_REACH * spacing / reach * (1.0 - 1e-9))), 40)  # parts at most
     best = np.argsort(-np.linalg.norm(across(np.eye(at.dimension)), axis=1), kind="stable")[:axes]
@@ -283,7 +277,6 @@ class RegionSum:
     about: NDArray[Any]
     quantity: str = "wall_force"
     ride: Ride | None = None
-    """Solid that carries the box."""
 
     def on_host(self, at: Reading) -> NDArray[Any]:
         arms, force = map(in_space, self.chosen(at))
@@ -315,7 +308,6 @@ class LoadSum:
 
 
 ParticleSum = WeightedSum | RegionSum | LoadSum
-"""A sum over particles (6,)."""
 
 
 def load_bars(bar: NDArray[Any], dimension: int) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -300,7 +300,6 @@ class Prepared(Cut, Protocol):
 
 
 def warn_of_places(simulation: Prepared, sensors: Mapping[str, Any]) -> None:
-    """Warn about sensors that fluid cannot reach."""
     for name, sensor in sensors.items():
         if (found := _doubt(simulation, sensor)) is not None:
             warn(f"the sensor {name!r} {found}.")

@@ -43,11 +43,9 @@ SIX = wp.types.vector(6, wp.float64)
 
 @dataclass(frozen=True)
 class Bars:
-    """Adjoints of intermediate values of a time step. The adjoints of quantities are added to these arrays. See
-    `cortado.solvers.solver.WithinBar`."""
+    """Adjoints of a time step's intermediate values. The adjoints of quantities are added to these arrays."""
 
     of: Adjoints
-    """Adjoints of sorted particles, parameters and solids."""
     p: wp.array
     stress: wp.array
     """Adjoint of the measured pressure (n,)."""
@@ -90,7 +88,6 @@ def circulation_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of density, of speed, and of vorticity."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"quantities_{kind}_{precision.name}") for kind in ("forward", "tangent", "derivative")]
 
@@ -111,7 +108,6 @@ def number_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
 @cache
 def wall_force_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the forces of particles on walls."""
     real, vector = discretisation.precision.real, discretisation.precision.vector
 
     @TypesByName(real, {vector: "push rub by_images"})
@@ -125,7 +121,6 @@ def wall_force_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def load_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of the force and torque of a particle on a solid."""
     real, vector = precision.real, precision.vector
     module, derivative = (kernel_module(f"{name}_{precision.name}") for name in ("load", "load_derivative"))
     numbers = ["cell", "period"]
@@ -185,8 +180,6 @@ def load_kernels(precision: Precision) -> Kernels:
 
 
 class OfParticles:
-    """A quantity of particles, such as density, speed or vorticity."""
-
     def __init__(self, solver: ParticleSolver, kernels: Kernels, kind: Any, total: Kernels | None = None, **given: Any):
         self._kernels, self._total, self._given = kernels, total, given
         self._q = solver.layout.arrays(q=kind, q_dot=kind)
@@ -299,8 +292,6 @@ class WallLoads:
 
 
 class SolidLoads:
-    """The force on a solid, and its torque about the middle of the solid."""
-
     def __init__(self, loads: WallLoads, solver: ParticleSolver, solid: NamedSolid):
         vector, layout, number = solver.layout.precision.vector, solver.layout, solid.number
         self._loads, self._layout, self._solid = loads, layout, number

@@ -53,7 +53,6 @@ class Moment:
     def of(
         cls, rollout: Rollout, step: int, state: State, evaluator: "Evaluator", wanted: set[str] | None = None
     ) -> "Moment":
-        """Make the moment after ``step`` steps of a rollout."""
         parameters = row_of(rollout, rollout.parameters.written, step)
         size = rollout.step_sizes.of_step(min(step, max(rollout.steps - 1, 0)))
         if size is not None:
@@ -61,8 +60,7 @@ class Moment:
         return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
-        """Return a quantity of the state as a read-only float64 array. For a batch, the first axis counts the
-        scenes."""
+        """Return a quantity as a read-only float64 array. For a batch, the first axis counts the scenes."""
         if name not in self._values:
             self.wanted.add(name)
             names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
@@ -78,24 +76,18 @@ class Moment:
         return self.evaluator().adjoint(bars, self)
 
     def tangents(self, names: list[str], dot: Given, parameters_dot: Given) -> Arrays:
-        """Return tangents of quantities, given tangents of the state's fields and of the step's parameters."""
         return self.evaluator().tangents(names, self, dot, parameters_dot)
 
 
 def _needs_the_step(name: str) -> bool:
-    """Test if a quantity depends on the pressure in the step."""
     return name in (STRESS, "wall_force") or is_load(name)
 
 
 class QuantityEvaluator:
-    """Computes quantities of states, with tangents and adjoints, in the arrays of a solver. No run may use the solver
-    meanwhile.
-
-    Arrays are in the order of the scene. For a batch, the first axis counts the scenes.
-    """
+    """Computes quantities in the arrays of a solver, so that no run may use the solver meanwhile. Results are in the
+    order of the scene. For a batch, the first axis counts the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
-        """Take a solver. Raises `InputError` for a solver without particles."""
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene is no ParticleSolver, so that quantities cannot be computed.")
         self.solver, self.dimension = solver, scene.dimension
@@ -141,7 +133,6 @@ class QuantityEvaluator:
 
     @in_turn
     def adjoint(self, bars: Mapping[str, NDArray], moment: Moment) -> tuple[Arrays, Arrays]:
-        """Convert adjoints of quantities to adjoints of the state's fields and of the step's parameters."""
         wanted, solver = self._checked(bars), self.solver
         if wanted == [STRESS]:
             return self._from_stress(bars[STRESS], moment)
@@ -305,7 +296,8 @@ def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
 
 
 def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArray) -> None:
-    """Add the adjoint of a parameter in one time step to its ``total`` over all steps, the transpose of `row_of`."""
+    """Add the adjoint ``bar`` of a parameter in one time step to its ``total`` over all steps, the transpose of
+    `row_of`."""
     shares = _shares_of_rows(rollout, name, row, total)
     if shares is None:
         total += bar
@@ -315,7 +307,7 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return the weights of time steps in the value of `row_of`, by step, or None for one constant in time."""
+    """Return weights by time step in the value of `row_of`, or None for a parameter that is constant in time."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None

@@ -40,15 +40,12 @@ class EverySteps:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the settings that a resumed run must not change."""
         return {"record_every": self.steps}
 
     def is_due(self, step: int, before: float, now: float) -> bool:
-        """Test if the state after ``step`` steps, at the time ``now`` [s] and after ``before`` [s], is recorded."""
         return step % self.steps == 0
 
     def announced(self, rollout: Rollout) -> NDArray[Any]:
-        """Return the expected times (frames,) [s] of all possible frames."""
         recorded = np.array([*range(0, rollout.steps, self.steps), rollout.steps])
         clock = Clock(rollout.clocks[0].steps, rollout.clocks[0].time)  # as steps of one length go on from the first
         return clock.times(recorded, float(rollout.time_steps[0]))
@@ -152,11 +149,8 @@ def recorded(
     quantities: Arrays,
     readings: Callable[[int], Mapping[str, Readings]],
 ) -> Trajectory | TrajectoryBatch:
-    """Make the trajectory of a rollout from ``fields`` and ``quantities`` of frames after ``steps`` (frames,) steps.
-
-    Arrays have the shape (frames, ...), or (frames, batch, ...) for a batch. ``readings`` returns the sensor readings
-    of a scene.
-    """
+    """``steps`` (frames,) has the number of steps before each frame. Arrays have the shape (frames, ...), or (frames,
+    batch, ...) for a batch. ``readings`` returns the sensor readings of a scene by its number."""
 
     def one(number: int, kept: slice, at: tuple[Any, ...]) -> Trajectory:
         own = {name: array[kept][at] for name, array in fields.items()}
@@ -206,7 +200,7 @@ def kept_by_steps(scene: QuantityEvaluator, rollout: Rollout, names: tuple[str, 
 
 class QuantityReader:
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, wanted: Mapping[int, str]):
-        """Read quantities during a run. ``wanted`` maps the number of a state to the name of a quantity."""
+        """``wanted`` maps the number of a state to the name of a quantity."""
         self.found: dict[int, Arrays] = {}
         self.beside = kept_by_steps(scene, rollout, tuple(sorted(set(wanted.values()))))
         self._scene, self._wanted = scene, wanted
@@ -219,8 +213,6 @@ class QuantityReader:
 
 
 class StepReader:
-    """A `ChunkReader` of sensors, which sums over particles on the device."""
-
     def __init__(self, scene: QuantityEvaluator, rollout: Rollout, sensors: dict[str, Summed], logs: list[SensorLog]):
         self.sensors, self._scene, self._rollout, self._logs = sensors, scene, rollout, logs
         length, layout, first = rollout.longest_chunk, rollout.solver.layout, rollout.initial

@@ -79,13 +79,10 @@ class RunFolder:
         device: str = "",
         overwrite: bool = False,
     ) -> Self:
-        """Make the folder of a new run. ``kind`` is the name of the command, and ``settings`` are its settings. A
-        resumed run must have the same kind and settings. ``device`` is a description of the device. ``overwrite``
-        removes the files of an earlier run.
+        """Make the folder of a new run of the command ``kind``. A resumed run must have the same kind and ``settings``.
+        ``overwrite`` removes the files of an earlier run.
 
-        Raises `InputError` if the folder is not writable, or contains a run or other files that the run would replace.
-        Raises `ComputationError` if the disk is full.
-        """
+        Raises `InputError` if the folder is not writable, or contains files that the run would replace."""
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
         noted["files"] = {table[key]: _mark(table[key]) for table, key in files_named(json.loads(scene_json))}
@@ -114,8 +111,7 @@ class RunFolder:
         settings: Mapping[str, Any] | None = None,
         device: str = "",
     ) -> Self:
-        """Open the folder of a run, and add this process to environment.json. Arguments are as in `create`. Raises
-        `InputError` if there is no run, or if its kind, scene or settings differ."""
+        """Open the folder of a run, and add this process to environment.json. Arguments are as in `create`."""
         folder = cls.open(path, TO_RESUME)
         folder.require(scene_json, kind, settings)
         noted = read_json(folder.environment)
@@ -129,7 +125,6 @@ class RunFolder:
         return folder
 
     def require(self, scene_json: str, kind: str, settings: Mapping[str, Any] | None = None) -> None:
-        """Raise `InputError` unless the run has the given kind, scene and settings."""
         noted = read_json(self.environment)
         former = noted.get("kind", kind)
         if former != kind:
@@ -160,7 +155,7 @@ class RunFolder:
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """Read the scene with ``overrides``, without warnings. Raises `InputError` if it or they are invalid."""
+        """Read the scene without warnings."""
         text = bytes_of(self.scene).decode(errors="replace")
         with unwarned():
             try:
@@ -253,7 +248,6 @@ def finite(value: Any) -> Any:
 
 
 def bytes_of(path: Path) -> bytes:
-    """Read a file. Raises `InputError` if it is not a regular file or is too large."""
     try:
         return content(path, LARGEST)
     except OSError as problem:
@@ -291,7 +285,6 @@ def as_json(value: Any) -> Any:
 
 
 def require_same(former: Any, given: Any, folder: Path) -> None:
-    """Raise `InputError` if settings differ from the settings of the run in a folder. The message names the setting."""
     for name, (before, now) in sorted(differences(former, given).items()):
         field = ".".join(part if not part.isdigit() else f"[{part}]" for part in name.split(".")).replace(".[", "[")
         found = f"The run in {folder} was begun with {field} = {_written(before)} and is now given"
@@ -299,8 +292,7 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
-    """Return the values that differ between ``one`` and ``other``, as pairs by dotted name. ``missing`` replaces an
-    absent value."""
+    """Return pairs of different values by dotted name. ``missing`` replaces an absent value."""
     are_lists = all(isinstance(own, list) and any(isinstance(e, Mapping) for e in own) for own in (one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}

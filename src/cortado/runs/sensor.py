@@ -26,14 +26,12 @@ class Cut(Protocol):
     def dimension(self) -> int: ...
 
     @property
-    def lattice(self) -> Lattice:
-        """Return the constants of the rest lattice, such as the volume of a particle and the periodic axes."""
+    def lattice(self) -> Lattice: ...
 
 
 class SensedScene(Cut, Protocol):
     @property
-    def solids(self) -> tuple[SolidTable, ...]:
-        """Return the solids in their initial poses."""
+    def solids(self) -> tuple[SolidTable, ...]: ...
 
     @property
     def container(self) -> Container: ...
@@ -60,14 +58,13 @@ class Sensor(Protocol):
 
 
 def named(what: str, name: Any, of: str) -> str:
-    """Return the name of an object. Raises `InputError` unless the name is a string."""
     if not isinstance(name, str) or not name:
         raise InputError(f"{what} is {shown(name)}, but must be the name of a {of}.")
     return name
 
 
 def point(what: str, values: Any) -> NDArray[Any]:
-    """Return a finite position or direction (d,). Raises `InputError` for invalid values."""
+    """Return a finite position or direction (d,)."""
     array = corner(what, values)
     if not np.isfinite(array).all():
         raise InputError(f"{what} is {array.tolist()}, but must be finite.")
@@ -75,7 +72,7 @@ def point(what: str, values: Any) -> NDArray[Any]:
 
 
 def corner(what: str, values: Any) -> NDArray[Any]:
-    """Return the corner (d,) of a region, whose components may be infinite. Raises `InputError` for invalid values."""
+    """Return the corner (d,) of a region, whose components may be infinite."""
     array = read_only(what, values)
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
@@ -85,7 +82,7 @@ def corner(what: str, values: Any) -> NDArray[Any]:
 
 
 def direction(what: str, values: Any) -> NDArray[Any]:
-    """Return a direction (d,) scaled to length 1. Raises `InputError` for invalid values."""
+    """Return a direction (d,) scaled to length 1."""
     array = point(what, values)
     if not array.any():
         raise InputError(f"{what} is {array.tolist()}, but must not be 0.")
@@ -93,7 +90,6 @@ def direction(what: str, values: Any) -> NDArray[Any]:
 
 
 def positive(what: str, value: Any) -> float:
-    """Return a finite positive number. Raises `InputError` for invalid values."""
     number = as_one_number(what, value)
     if not 0.0 < number < np.inf:
         raise InputError(f"{what} is {number:g}, but must be greater than 0 and finite.")
@@ -106,7 +102,6 @@ def checked_sensor(sensor: Any) -> Sensor:
 
 
 def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict[str, Sensor]:
-    """Return sensors by name. Raises `InputError` for names in ``taken``, and for objects that are not sensors."""
     if given is None:
         return {}
     require_table("sensors", given, "{'gauge': sensor}")
@@ -118,7 +113,6 @@ def checked_sensors(given: Mapping[str, Sensor] | None, taken: set[str]) -> dict
 
 
 def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
-    """Return the reading (k,) of a sensor. Raises `InputError` unless the reading has one number for each column."""
     what, columns = f"value of the sensor {type(sensor).__name__}", len(sensor.columns(at.dimension))
     found = as_numbers(what, sensor.value(at))
     if found.shape != (columns,):
@@ -127,7 +121,6 @@ def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
 
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
-    """Return a vector of the scene's dimension. Raises `InputError` for a wrong length."""
     if len(values) != dimension:
         raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
     return values
@@ -181,7 +174,6 @@ class SensorLog:
         self._rows = {name: list(readings[name].values[: steps + 1]) for name in self.sensors}
 
     def readings(self, times: NDArray[Any]) -> dict[str, Readings]:
-        """Return the readings of all states that were read, given the ``times`` [s] of the states."""
         count = min(map(len, self._rows.values()), default=0)
         found = {}
         for name, units in self._units.items():
@@ -202,7 +194,6 @@ def as_csv(readings: Mapping[str, Readings]) -> str:
 
 
 def from_csv(path: Path) -> dict[str, Readings]:
-    """Read a file written by `as_csv`. Raises `InputError` for any other file."""
     columns = read_columns(path)
     times, found = columns.pop(TIME, np.zeros(0)), dict[str, dict[str, str]]()
     if not len(times):
@@ -234,8 +225,6 @@ def _of(read: Readings, column: str) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredColumn:
-    """Measured and simulated values of one number of a sensor."""
-
     name: str
     """Name of the sensor and its number, such as "gauge.height"."""
     unit: str
@@ -260,12 +249,8 @@ class MeasuredColumn:
 
 
 def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
-    """Read a table of measured data, and pair each column with the readings of a sensor.
-
-    The table has a column "time" [s] and columns such as "gauge.height", with names as in sensors.csv. Units in
-    brackets may be left out, and entries may be empty. Raises `InputError` for an invalid table, a wrong unit, an
-    unknown sensor, or a table without points during the run.
-    """
+    """Pair the columns of a table with readings. A column "time" [s] and columns named as in sensors.csv are expected.
+    Units in brackets may be left out, and entries may be empty."""
     columns = read_columns(path)
     named = {name_and_unit(head): values for head, values in columns.items()}
     times = named.get(("time", "s"), named.get(("time", None)))
@@ -298,8 +283,7 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
 def measured_columns(
     path: Path, units: Mapping[str, str], own: str = "", sensors: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns of a table by name, (lines,). Columns of ``sensors`` other than ``own`` are left out. Names
-    may begin with ``own`` and end with a unit. Raises `InputError` for a wrong unit or a repeated column."""
+    """Return columns (lines,) by name. The names in the table may begin with ``own`` and end with a unit."""
     found: dict[str, NDArray[Any]] = {}
     for head, values in read_columns(path).items():
         name, unit = name_and_unit(head)

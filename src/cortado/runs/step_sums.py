@@ -201,13 +201,10 @@ def _kernels(precision: Precision) -> SimpleNamespace:
 
 
 class StepQuantities:
-    """Quantities and loads for each step of a chunk."""
-
     def __init__(self, formulas: Mapping[str, QuantityFormula], solver: ParticleSolver, length: int):
         self._formulas, self._solver, self._length, self.kept = formulas, solver, length, dict[str, wp.array]()
 
     def launch(self, step: int, parameters: Parameters) -> None:
-        """Launch the formulas of the quantities for step number ``step`` of the chunk."""
         solver, context = self._solver, self._solver.context(parameters)
         pressures = solver.pressures()
         if pressures is None:
@@ -223,16 +220,14 @@ class StepQuantities:
                 unsort(context, found, own)
 
     def of_step(self, name: str, step: int) -> wp.array:
-        """Return a load, or a quantity in the order of the scene, for step number ``step`` of the chunk."""
+        """Return a load, or a quantity in the order of the scene."""
         size = len(self.kept[name]) // self._length
         return self.kept[name][step * size : (step + 1) * size]
 
 
 class CarriedRows:
-    """The places of a sensor on a solid, in each state of a chunk."""
-
     def __init__(self, ride: Ride, point: NDArray[Any], scene: SensedScene, solver: ParticleSolver, rows: int):
-        """Allocate arrays for ``rows`` states. ``point`` (d,) [m] is the initial place of the sensor."""
+        """``point`` (d,) [m] is the initial place of the sensor."""
         table, layout = ride.table(scene), solver.layout
         self._device, self._members, self._ride = solver.device, layout.members, _Ride()
         self._ride.arm = wp.vec3d(*in_space(point - table.middle()))
@@ -262,8 +257,6 @@ class CarriedRows:
 
 
 class ChunkSums:
-    """The sums of one sensor over particles, for each state of a chunk."""
-
     def __init__(self, summed: ParticleSum, scene: SensedScene, solver: ParticleSolver, length: int):
         layout, self._summed, domain = solver.layout, summed, scene.lattice.domain
         self._scenes, self._particles, self._device = layout.members, layout.particles, solver.device
@@ -282,8 +275,7 @@ class ChunkSums:
         self._carried = None if ride is None or point is None else CarriedRows(ride, point, scene, solver, rows)
 
     def launch(self, count: int, first: State, later: StateSeries, kept: Mapping[str, wp.array]) -> wp.array:
-        """Launch the sums for the states before each of ``count`` steps. Return an array with a sum for each state and
-        scene."""
+        """Return an array with a sum for each state and scene."""
         if isinstance(self._summed, LoadSum):
             return self._total if self._summed.quantity is None else kept[self._summed.quantity]
         key = count, first.positions.ptr

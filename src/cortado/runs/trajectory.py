@@ -64,7 +64,6 @@ def fields_of(of: Frame | Trajectory) -> dict[str, NDArray[Any]]:
 
 
 def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return a recorded quantity, the speed or one of ``fields``. Raises `InputError` for unknown names."""
     check_quantity(name, others=tuple(fields))
     if name in fields:
         return fields[name]
@@ -343,7 +342,6 @@ class Trajectory:
 
 
 def noted(diagnostics: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
-    """Return a diagnostic (steps,) by name. Raises `InputError` if the solver does not record it."""
     if name not in diagnostics:
         raise InputError(f"{name} is no diagnostic of this solver, whose diagnostics are {', '.join(diagnostics)}.")
     return diagnostics[name]

@@ -176,12 +176,8 @@ class Column:
         return ends, filled[ends]
 
     def level(self, depth: float) -> tuple[float, NDArray[Any], float]:
-        """Return the height [m] of the surface, and its derivatives. ``depth`` [m] is the depth that the fluid would
-        have without solids.
-
-        The first derivative is with respect to the volume of solids in each level (levels,). The second derivative is
-        with respect to ``depth``.
-        """
+        """Return the height [m] of the surface, and its derivatives with respect to the volume of solids in each level
+        (levels,) and to ``depth``. ``depth`` [m] is the depth that the fluid would have without solids."""
         (ends, filled), step, levels = self._ends, self.axis.step, np.arange(len(self.room))
         low = max(int(np.searchsorted(filled, depth, side="right")) - 1, 0)
         if low == len(ends) - 1:  # above all solids
@@ -304,7 +300,6 @@ class WaveGauge(Summed):
         return {"height": "m"}
 
     def summed(self, at: SensedScene) -> WeightedSum:
-        """Return the sum over particles in the column."""
         axis, across, ride = self._axis(at), at.dimension - 1, ride_of(self.on, self.axes == "body", at)
         finer = axis.reach / 4.0  # as solids cut particles
         if ride is not None:
