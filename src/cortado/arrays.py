@@ -26,11 +26,7 @@ def as_number(value: Any) -> float | None:
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
-    """Convert real numbers to a float64 array. The numbers may be a list or an array of another library. Arrays of
-    float64 are not copied.
-
-    Raises `InputError` for complex numbers, text, bools and masked entries. The error message begins with ``what``.
-    """
+    """Convert real numbers to a float64 array. Float64 arrays are not copied."""
     try:
         array = np.asarray(value)
         kind = array.dtype.kind
@@ -53,7 +49,6 @@ def is_same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def as_precise_numbers(what: str, value: Any) -> np.ndarray:
-    """Convert real numbers to float64. Raises `InputError` for other types and for float16."""
     kind = str(getattr(value, "dtype", ""))
     if kind.endswith("float16"):  # bfloat16 too
         raise InputError(f"{what} is {kind}, but must be float32 or float64, as half precision rounds to three digits.")
@@ -67,7 +62,6 @@ def read_only(what: str, value: Any) -> np.ndarray:
 
 
 def as_one_number(what: str, value: Any) -> float:
-    """Convert one real number to a float, or raise `InputError`."""
     array = as_numbers(what, value)
     if array.shape:
         raise InputError(f"{what} has shape {array.shape}, but must be one number.")
@@ -79,7 +73,6 @@ def is_whole(value: object) -> bool:
 
 
 def require_whole(what: str, value: object, least: int) -> None:
-    """Raise `InputError` unless ``value`` is a whole number of at least ``least``."""
     if not is_whole(value) or value < least:  # type: ignore[operator]
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
 
@@ -90,8 +83,7 @@ def require_at_most(what: str, value: Any, most: int) -> None:
 
 
 def whole_number(what: str, value: Any, least: int) -> int:
-    """Convert a whole number, such as 3 or 3.0, to an int. Raises `InputError` for any other value, or for a number
-    below ``least``."""
+    """Convert a whole number, such as 3 or 3.0, to an int."""
     whole = is_whole(value) or (isinstance(value, (float, np.floating)) and value.is_integer())
     if not whole or value < least:
         raise InputError(f"{what} is {shown(value)}, but must be a whole number of at least {least}.")
@@ -101,14 +93,12 @@ def whole_number(what: str, value: Any, least: int) -> int:
 
 
 def require_function(what: str, value: Any, *arguments: str) -> None:
-    """Raise `InputError` unless ``value`` is None or a function that takes ``arguments``."""
     if value is not None:
         require_arguments(what, value, arguments, "; or leave it out")
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raise `InputError` if ``function`` does not take the arguments ``wanted``. The error message ends with
-    ``other``."""
+    """Raise `InputError` unless ``function`` takes the arguments ``wanted``. ``other`` ends the message."""
     if not callable(function) or isinstance(function, type):
         said = f"{what} is {shown(function)}"
         raise InputError(f"{said}, but must be a function of {', '.join(wanted) or 'nothing'}{other}.")
@@ -130,8 +120,7 @@ def require_truth(what: str, value: object) -> None:
 
 
 def require_methods(what: str, value: object, names: tuple[str, ...], wanted: str) -> None:
-    """Raise `InputError` unless ``value`` is an object with the methods ``names``. The error message says that the
-    value must be ``wanted``."""
+    """Raise `InputError` unless ``value`` has the methods ``names``. ``wanted`` describes a valid value."""
     if isinstance(value, type) or not all(callable(getattr(value, name, None)) for name in names):
         raise InputError(f"{what} is {shown(value)}, but must be {wanted}.")
 
@@ -146,7 +135,6 @@ def check_steps(steps: int, least: int = 1) -> int:
 
 
 def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
-    """Return step numbers as a list. Raises `InputError` unless all are whole numbers from 0 to ``most``."""
     if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
         raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
     found = [whole_number("a number of steps", step, 0) for step in steps]
@@ -166,7 +154,6 @@ def _is_real(value: Any) -> bool:
 
 
 def require_names(what: str, names: Any) -> list[Any]:
-    """Return a sequence of names as a list, or raise `InputError` for a single string."""
     if isinstance(names, (str, bytes)) or not isinstance(names, Iterable):
         raise InputError(f"{what} is {shown(names)}, but must be a list of names.")
     return list(names)

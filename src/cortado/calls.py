@@ -35,7 +35,7 @@ def face(module: dict[str, Any]) -> Callable[[], list[str]]:
 
 
 def public(value: T) -> T:
-    """Wrap a function, or the public methods of a class, with `told`. Any other value is returned unchanged."""
+    """Wrap a function, or the public methods of a class, with `told`."""
     if not str(getattr(value, "__module__", "")).startswith("cortado"):
         return value
     made: Any = value
@@ -102,7 +102,7 @@ def _misfit(function: Any, bound: BoundArguments) -> str | None:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Test whether a value matches a type hint. Iterators are not consumed."""
+    """Test whether a value matches a type hint, without consuming an iterator."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
@@ -236,8 +236,7 @@ def sized(arrays: Mapping[str, Any]) -> str:
 
 
 class ShortRepr:
-    """A base class of dataclasses. In ``repr``, arrays are replaced by their shapes. Subclasses must be declared with
-    ``repr=False``."""
+    """A base class whose ``repr`` shows shapes of arrays. Its dataclasses must be declared with ``repr=False``."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

@@ -45,9 +45,7 @@ class InputError(CortadoError):
 
 
 class OutOfRangeError(InputError):
-    """An error for a parameter value that makes a run impossible. Either the value is out of range or beyond the
-    floating-point precision, or there is no room for the fluid. If a problem is evaluated at many points, only this
-    point fails."""
+    """An error for a parameter value that makes a run impossible. `evaluate` continues with other points."""
 
 
 class Words(str):
@@ -62,8 +60,7 @@ class SceneError(CortadoError):
     """An error in a scene. The message has the key, the wrong value, and what the value must be. The exit code is 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """Store the parts of the error message. ``sentence`` replaces "is <found>, but must be <wanted>" in the
-        message."""
+        """Store the message's parts. ``sentence`` replaces "is <found>, but must be <wanted>"."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
         """Path of the scene file as the user gave it, or None for a scene built in Python."""
@@ -89,8 +86,7 @@ class ComputationError(CortadoError):
 
 
 class DivergedError(ComputationError):
-    """An error for a lost particle. A particle is lost if it leaves its container, or if its position is too far away
-    or not finite."""
+    """An error for a particle that left its container, flew too far away or has no finite position."""
 
     def __init__(
         self, step: int, particle: int, advice: str, where: str = "was lost", others: int = 0, preface: str = ""

@@ -159,7 +159,7 @@ class Distributed(Executor):
             raise self.lost() from error
 
     def replace_workers(self) -> None:
-        """Replace ended workers of this machine. The method is called every second during a computation."""
+        """Replace ended workers of this machine."""
 
     def lost(self) -> ComputationError:
         return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
@@ -174,10 +174,8 @@ class _Map:
         self._executor, self._payload, self._on_result = executor, payload, on_result
         self._calls = executor.client.get_executor(pure=False)
         self._sent: dict[Future[Any], tuple[int, bytes]] = {}
-        """Number of the item and pickled item, by future."""
         self._results: dict[int, Any] = {}
         self._failed: tuple[int, BaseException] | None = None
-        """Number and error of the first failed item."""
         self._name = f"cortado-{uuid4().hex}"
         self._most = 0
         self._counted, self._manned = -LOOK, time.monotonic()
@@ -219,7 +217,7 @@ class _Map:
         return [self._results[number] for number in range(len(self._results))]
 
     def _fill(self, left: Iterator[tuple[int, Any]]) -> bool:
-        """Send items to workers, unless an item has failed. Return True if a result is still missing."""
+        """Send items to workers. Return True if a result is still missing."""
         self._count_workers(LOOK)
         while not self._most and not self._sent:  # how much an item asks for may depend on how many workers there are
             time.sleep(WAIT)
@@ -232,8 +230,7 @@ class _Map:
         return bool(self._sent)
 
     def _count_workers(self, interval: float) -> None:
-        """Count workers, at most once per interval [s]. Raises `ComputationError` if there are no workers for
-        too long."""
+        """Count workers, at most once per ``interval`` [s]."""
         now = time.monotonic()
         if now - self._counted < interval:
             return
@@ -288,7 +285,6 @@ def _connected(module: Any, address: str) -> Any:
     from distributed.comm import connect
 
     async def meet() -> None:
-        """Raise `OSError` quickly if the scheduler does not answer."""
         comm = await connect(address, timeout=REACHED)
         await comm.close()
 
@@ -311,18 +307,16 @@ GONE = "3 s"
 PROCESSES_A_CORE = 4
 LEAST_LIMIT = 64
 IGNORE_INTERRUPTS = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
-"""Python code that makes workers ignore Ctrl-C."""
 
 
 class LocalWorkers(Distributed):
-    """An executor on worker processes of this machine. Each worker has a nanny process that restarts the worker."""
+    """An executor on processes of this machine. A nanny process restarts each worker process."""
 
     def __init__(self, client: Any, cluster: Any):
         super().__init__(client)
         self._cluster = cluster
 
     def replace_workers(self) -> None:
-        """Replace workers if their nanny process has ended."""
         self._cluster.scale(len(self._cluster.worker_spec))
 
     def deserted(self, seconds: float) -> ComputationError:
@@ -383,8 +377,6 @@ def _environments(number: int | None, device: str) -> list[dict[str, str]]:
 
 
 def require_processes(what: str, number: object) -> None:
-    """Raise `InputError` unless ``number`` is a possible number of processes. The error message begins with
-    ``what``."""
     require_whole(what, number, 1)
     cores = usable_cores()
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)

@@ -1,8 +1,4 @@
-"""Import names when they are first used, so that ``import cortado`` is quick.
-
-Cortado's core does not import packages such as pictures. Methods that need such a package, as `Trajectory.film`, use
-`on_top`.
-"""
+"""Import names when they are first used, so that ``import cortado`` is quick."""
 
 import importlib
 
@@ -13,8 +9,7 @@ if TYPE_CHECKING:
 
 
 def getter(package: str, homes: "Mapping[str, str] | None" = None) -> "Callable[[str], Any]":
-    """Return a ``__getattr__`` for a package, which imports its modules and the names in ``homes``. ``homes`` maps a
-    name to its module. The module is relative to the package unless it begins with ``cortado.``."""
+    """Return a ``__getattr__`` that imports a package's modules, and names from the modules in ``homes``."""
 
     def found(name: str) -> "Any":
         if homes and name in homes:
@@ -42,5 +37,5 @@ FUNCTIONS = {name: home for home, names in _NAMES.items() for name in names.spli
 
 
 def on_top(name: str) -> "Any":
-    """Import and return a function named in `FUNCTIONS`."""
+    """Import and return a function of `FUNCTIONS`, from a package that is not a part of Cortado's core."""
     return getattr(importlib.import_module(f"cortado.{FUNCTIONS[name]}"), name)

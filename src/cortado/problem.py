@@ -78,7 +78,6 @@ class ProblemForwardPass(Staying):
         return gradient, without_lost(dict.fromkeys(rollout.lost, np.nan), initial_state)
 
     def _backward(self, derivative: BackwardStep, observe: Observer | None = None) -> tuple[State, Arrays]:
-        """Return the adjoint of the first state, and the gradient."""
         self._residual.bring_back()
         rollout = self._residual.rollout
         first = rollout.backward(derivative, {step: bar.state for step, bar in self._bars.items()}, observe)
@@ -349,9 +348,7 @@ class Problem:
     def fingerprint(self) -> str:
         """Text that identifies the problem, for checkpoints.
 
-        The text depends on steps, precision, scene, first positions, free energy, user-defined forces and solver. The
-        loss is identified by its ``fingerprint`` or the code of its function. A loss without either is identified by
-        its type.
+        A loss is identified by its ``fingerprint``, or by the code of its function, or else only by its type.
         """
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {

@@ -21,12 +21,11 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
 class Watch:
-    """Records quantities and reads sensors of a rollout, user-defined ones with the arrays of a second solver."""
+    """Records quantities and reads sensors of a rollout."""
 
     def __init__(
         self, simulation: Any, rollout: Rollout, record: Iterable[str] = (), sensors: Mapping[str, Sensor] | None = None
     ):
-        """Watch a rollout of a `Simulation`. Raises `InputError` for unknown quantities, or own sensors in a batch."""
         if sensors is not None:
             require_table("sensors", sensors, "{'probe': cortado.sensors.PressureProbe([0.1, 0.1])}")
 
@@ -59,8 +58,7 @@ class Watch:
     def run(
         self, is_frame: Callable[[int], bool], record: Observer, observe: Callable[[int], object] | None = None
     ) -> State:
-        """Run the rollout forward and return its last state. ``record`` is called with each frame, and ``observe`` with
-        the number of each state. States before a `DivergedError` or an interrupt are still read."""
+        """Run the rollout and return its last state. States before an error or an interrupt are still read."""
 
         def look(step: int, state: State) -> None:
             if is_frame(step):
@@ -86,7 +84,7 @@ class Watch:
             self._reader.look()
 
     def frame(self, step: int, state: State) -> Arrays:
-        """Return the recorded quantities after ``step`` steps. They are NaN if the next step loses a particle."""
+        """Return the recorded quantities after ``step`` steps, or NaN if the next step loses a particle."""
         if not self.names:
             return {}
         found, real = dict[str, NDArray](), self._rollout.solver.discretisation.precision.numpy
@@ -100,7 +98,6 @@ class Watch:
         return found
 
     def read(self, step: int, state: State) -> None:
-        """Read user-defined sensors."""
         if self._on_host:
             at: Any = self._snapshot(step, state, self._evaluator)
             for name, sensor in self._on_host.items():

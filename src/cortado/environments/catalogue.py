@@ -25,8 +25,7 @@ def box(lower: Sequence[float], upper: Sequence[float], **others: Any) -> dict[s
 
 
 def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Actuator, Actuator]:
-    """Return two actuators of a solid: one for its motion along x and one for its rotation about z. The greatest
-    velocities are ``fastest`` [m/s] and ``turning`` [rad/s]."""
+    """Return actuators for the motion of a solid along x [m/s] and for its rotation about z [rad/s]."""
     still, plane = (0.0,) * dimension, dimension == 2
     turn: Any = {"rest": (0.0,), "axes": (0,)} if plane else {"rest": still, "axes": (2,)}
     moved = Velocity(f"{solid}.displacement", still, (0,), (fastest,))
@@ -34,8 +33,7 @@ def led(solid: str, fastest: float, turning: float, dimension: int) -> tuple[Act
 
 
 class Vessels(Task):
-    """A base class of tasks with cups and jugs. In 2-D a vessel is a cross-section. In 3-D a vessel is round, with its
-    axis at z = 0."""
+    """Tasks with cups and jugs. In 3-D a vessel is round, and its axis is at z = 0."""
 
     view: ClassVar[dict[str, Any]] = {}
 
@@ -43,22 +41,19 @@ class Vessels(Task):
         return [x, y, 0.0][: self.dimension]
 
     def corners(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[list[float], list[float]]:
-        """Return the corners of a box, given the corners of its cross-section [m]. In 3-D the box has a square base
-        about z = 0."""
+        """Return the corners [m] of a box. In 3-D the base of the box is a square about z = 0."""
         half = 0.5 * (upper[0] - lower[0])
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the scene table of a fluid, given the corners of its cross-section [m]. The fluid fills a box in 2-D
-        and a cylinder in 3-D."""
+        """Return the scene table of a fluid, which fills a box in 2-D and a cylinder in 3-D. Corners are in m."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
         return {"shape": "cylinder", "base": self.place(0.5 * (lower[0] + upper[0]), lower[1]), **size, "phase": phase}
 
     def room(self, lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
-        """Return the scene table of a container in 2-D. In 3-D there is no container, and spilt fluid falls without
-        end."""
+        """Return the scene table of the container. A 3-D scene has no container."""
         return box(lower, upper) if self.dimension == 2 else {"shape": "none"}
 
 
@@ -161,16 +156,14 @@ class Latte(Task):
 
 
 def hidden_actions(task: Latte) -> NDArray:
-    """Return the actions of the hidden path (horizon, 1). The path goes once around a heart shape, and then to the
-    middle of the heart."""
+    """Return actions (horizon, 1) that lead the nozzle once around a heart, and then to its middle."""
     angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
     return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
 
 
 @cache
 def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]:
-    """Return the particle positions (horizon, n, d) [m] in a run along the hidden path. Also return the weights of milk
-    particles in the reward (horizon, n) [1/m2]."""
+    """Return particle positions (horizon, n, d) [m] on the hidden path, and weights (horizon, n) [1/m2]."""
     simulation = Simulation(task.scene, device, precision)
     (nozzle,), steps = task.actuators, task.horizon * task.substeps
     path = nozzle.over(task.horizon, task.substeps, task.time_step).parameter(hidden_actions(task))
@@ -374,8 +367,7 @@ TASKS = {one.name: one for one in _TASKS}
 
 
 def task_of(task: str | Task, size: str | None) -> Task:
-    """Return a task of the catalogue by name and size. The default size is "small". A user-defined `Task` is returned
-    unchanged. Raises `InputError` for an unknown name or size, or if a size is given together with a `Task`."""
+    """Return a task of the catalogue, or a user-defined `Task` unchanged. The default size is "small"."""
     if isinstance(task, Task):
         if size is not None:
             raise InputError(f"size is {shown(size)}, but must be left out, as the task is a Task object.")

@@ -357,7 +357,7 @@ class FluidVectorEnv(VectorEnv):
             raise InputError(f"{what} is called after close(), but must come before it.")
 
     def _begin(self, which: NDArray) -> dict[int, Start]:
-        """Begin episodes in the environments marked in ``which`` (num_envs,), and return the initial states."""
+        """Begin episodes where the mask ``which`` (num_envs,) is True. Return their first states."""
         starts = {b: self.scenes.drawn(self._generators[b]) for b in np.flatnonzero(which).tolist()}
         self.scenes.begin(starts)
         self._over = self._over & ~which
@@ -365,7 +365,7 @@ class FluidVectorEnv(VectorEnv):
 
 
 def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
-    """Return the saved state in the options of a reset, or None. Raises `InputError` for unsuitable options."""
+    """Return the saved state in the options of a reset, or None."""
     require_table("options", options or {}, "{'state': state}")
     found, known = options or {}, ("state", *others)
     for name in found:

@@ -35,7 +35,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def sample(per: int, origin: vector, period: vector, frequency: vector, chosen, x, v, seen: samples):
-        """Store velocities and positions of the ``chosen`` particles. Positions are moved into the periodic box."""
+        """Store the state of ``chosen`` particles. Positions are moved into the periodic box."""
         b, p, axis = wp.tid()
         i = b * per + chosen[p]
         lap = wp.floor((x[i][axis] - origin[axis]) * frequency[axis])
@@ -50,7 +50,7 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.func
     @typed
     def outside(r, angle, period, frequency, b: int, lower: boxes, upper: boxes):
-        """Return the particle's position relative to the boxes, and the vector from the nearest box to the particle."""
+        """Return a particle's position relative to the boxes, and its offset from the nearest box."""
         place, found, least = vector(), vector(), real(FAR)
         for k in range(lower.shape[1]):
             middle = turned(real(0.5) * (lower[b, k] + upper[b, k]), angle)
@@ -68,8 +68,7 @@ def environment_kernels(precision: Precision) -> Any:
     def share(
         per: int, width: real, period: vector, frequency: vector, x, place, turn, lower: boxes, upper: boxes, value
     ):
-        """Store 1 / (1 + e^2 / w^2) for each particle, with the distance e to the nearest box and the ``width`` w.
-        Boxes may move with a solid."""
+        """Store 1 / (1 + e^2 / w^2), where e is the distance to the nearest box and w the ``width``."""
         i = wp.tid()
         b = i // per
         _y, way = outside(x[i] - place[b], turn[b], period, frequency, b, lower, upper)
@@ -131,7 +130,6 @@ def environment_kernels(precision: Precision) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def missed(per: int, step, target: wp.array2d(dtype=vector), weight: wp.array2d(dtype=real), x, value):
-        """Store the weighted squared distance from each particle to its target in the current step."""
         i = wp.tid()
         k, p = step[i // per], i % per
         r = x[i] - target[k, p]

@@ -1,8 +1,4 @@
-"""Step many scenes of one task together, and save and restore their states.
-
-On a CPU, only launches with few particles are captured as graphs. A batch of medium size is therefore split into
-several launches.
-"""
+"""Step many scenes of one task together, and save and restore their states."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -39,7 +35,7 @@ LANES = 1
 """Number of threads per particle. The number is fixed, so that results are bitwise equal for all batch sizes."""
 SEEN = 32
 MOST_PARTS = 16
-"""Greatest number of parts of a batch. A larger batch is not split, and uses all cores without graphs."""
+"""Greatest number of parts of a batch. A larger batch uses all cores without a split, but without graphs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +54,11 @@ class EnvState:
     """
 
     kind: str
-    """Text with the number of scenes, task, size, precision and observation. `restore` requires equal texts of state
-    and environment."""
+    """Text on scenes, task, size, precision and observation. `restore` requires equal texts."""
     scene: Scene
     fields: Mapping[str, Any]
     """Fields of the fluid by name (scenes * n,), as Warp or NumPy arrays."""
     clocks: tuple[RestartState, ...]
-    """Time, step number and origin of each scene."""
     step_number: NDArray
     """Number of environment steps in the episode of each scene (scenes,)."""
     starts: tuple[Start, ...]
@@ -135,8 +129,8 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """A stepper that splits a batch into parts and advances each part by ``steps`` steps. The split does not change the
-    results in any bit."""
+    """A stepper that splits a batch into parts, because only small launches on a CPU are captured as graphs. The split
+    does not change any bit of the results."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
         scenes = simulation.batch or 1
@@ -146,7 +140,6 @@ class SideBySide:
 
     @property
     def lost(self) -> dict[int, DivergedError]:
-        """Errors of the scenes that lost a particle in the last call, by scene number."""
         each = zip(self._ranges, self.steppers, strict=True)
         return {first + b: error for (first, _), one in each for b, error in one.rollout.lost.items()}
 
@@ -178,7 +171,7 @@ class SideBySide:
 
 
 class Scenes:
-    """A batch of scenes of one task, which are stepped together. Each scene has its own episode."""
+    """A batch of scenes of one task. Each scene has a separate episode."""
 
     def __init__(
         self, task: Task, scenes: int, device: str, precision: str, seen: int, sensors: Mapping[str, Sensor] | None
@@ -205,7 +198,7 @@ class Scenes:
         self._now = [one.at_rest(scenes) for one in task.actuators]
         self.starts: list[Start] = [Start(self.simulation.positions, self.goal[b]) for b in range(scenes)]
         self._lost: set[int] = set()
-        """Numbers of diverged scenes. Their states are meaningless."""
+        """Numbers of diverged scenes, whose states are meaningless."""
         self._given = task, scenes, device, precision, seen, sensors
         still = {name: np.repeat(row, task.substeps, axis=1) for name, row in self._driven.items()}
         with unwarned():  # see `advance`
@@ -246,7 +239,7 @@ class Scenes:
 
     @WARP
     def taken(self, saved: EnvState) -> DeviceState:
-        """Return the saved states. Raises `InputError` for states of a different task, batch or scene."""
+        """Copy a saved state to the device."""
         if not isinstance(saved, EnvState):
             raise InputError(f"state is {shown(saved)}, but must be a state that an environment has saved.")
         own = self.simulation.scene
@@ -290,8 +283,7 @@ class Scenes:
         self.state = DeviceState(arrays, tuple(scenes))
 
     def step(self, actions: NDArray) -> tuple[NDArray, dict[int, str]]:
-        """Step all scenes with actions (scenes, a) from -1 to 1. Return the rewards (scenes,), and the error messages
-        of diverged scenes by scene number. Diverged scenes must be reset."""
+        """Step all scenes with actions (scenes, a). Return rewards (scenes,), and errors of diverged scenes."""
         self.advance(actions)
         rewards = self.reward.values(StepEnd(self.state.arrays, self.goal, self.step_number, self._domain))
         lost = {}

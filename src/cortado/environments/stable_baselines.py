@@ -73,7 +73,6 @@ class StableBaselinesVecEnv(VecEnv):
         return seen
 
     def step_async(self, actions: NDArray) -> None:
-        """Store the actions (num_envs, a) for the next `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
@@ -90,7 +89,6 @@ class StableBaselinesVecEnv(VecEnv):
         return seen, rewards.astype(np.float32), terminated | truncated, infos
 
     def close(self) -> None:
-        """Close the environments. No episode can begin afterwards."""
         self.envs.close()
 
     def get_images(self) -> list[NDArray[np.uint8] | None]:

@@ -1,5 +1,4 @@
-"""Base classes of control tasks. An `Actuator` converts actions to values of a parameter over time. The values are an
-affine function of the actions. Actions are numbers from -1 to 1, constant during an environment step."""
+"""Base classes of control tasks, and actuators that convert actions to a parameter over time."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -19,8 +18,8 @@ from cortado.simulation import Simulation
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """An actuator converts actions to components of a parameter. The command is the action times ``greatest``. During
-    an environment step the command changes linearly from its last value."""
+    """An actuator converts actions from -1 to 1 to components of a parameter. The command is the action times
+    ``greatest``. During an environment step the command changes linearly from its last value."""
 
     parameter: str
     """Name of the driven parameter, such as "cup.displacement"."""
@@ -71,8 +70,7 @@ class Actuator(ABC):
 
 @dataclass(frozen=True)
 class Velocity(Actuator):
-    """An actuator with velocities as actions, in m/s or rad/s. The command is the time derivative of the driven
-    component."""
+    """An actuator whose command is the time derivative of the driven component [m/s or rad/s]."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step * command
@@ -80,11 +78,10 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """An actuator with target values as actions. The driven component approaches its target with the time constant
-    ``lag``."""
+    """An actuator whose command is the target of the driven component."""
 
     lag: float = 0.1
-    """Time constant of the actuator [s]."""
+    """Time constant of the approach to the target [s]."""
 
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
         return q + time_step / self.lag * (command - q)
@@ -92,8 +89,7 @@ class Position(Actuator):
 
 @dataclass(frozen=True)
 class Task(ABC):
-    """The base class of control tasks. A task has a scene, actuators, a reward and goals, in a small and a
-    large size."""
+    """The base class of control tasks. A task has a scene, actuators, a reward and goals, in two sizes."""
 
     size: str = "small"
     """"small", for a CPU, or "large", for a GPU. The large size has `finer` times as many particles along each axis."""
@@ -171,7 +167,6 @@ class Task(ABC):
 
 
 def checked_scene(task: Task) -> Scene:
-    """Return the scene of a task. Raises `InputError` if the scene and the task have different time steps."""
     scene = task.scene
     found, wanted = scene.solver.time_step, task.time_step
     if found == "auto" or not np.isclose(found, wanted, rtol=1e-6, atol=0.0):
@@ -182,7 +177,7 @@ def checked_scene(task: Task) -> Scene:
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return actions clipped to -1 to 1. Raises `InputError` for a wrong shape and for values that are not finite."""
+    """Return actions clipped to the range from -1 to 1."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")

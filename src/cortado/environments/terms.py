@@ -62,12 +62,10 @@ Boxes = Callable[[NDArray], tuple[NDArray, NDArray]]
 
 @dataclass(frozen=True)
 class OneBox:
-    """A function that returns the same box for every goal."""
+    """A function that returns the same box [m] for every goal."""
 
     lower: tuple[float, ...]
-    """Lower corner [m]."""
     upper: tuple[float, ...]
-    """Upper corner [m]."""
 
     def __call__(self, goal: NDArray) -> tuple[NDArray, NDArray]:
         lower, upper = (np.tile(corner, (len(goal), 1, 1)) for corner in (self.lower, self.upper))
@@ -94,7 +92,7 @@ class OverParticles:
         return total(value.flatten()).numpy() / self._over(at)
 
     def adjoint(self, at: StepEnd, factor: NDArray, bar: State, **others: wp.array) -> None:
-        """Add ``factor`` times the derivative of the term to ``bar``. ``others`` are further outputs of the kernel."""
+        """Add ``factor`` times the derivative to ``bar``. ``others`` are further outputs of the kernel."""
         scaled = _reals(at, factor / self._over(at))
         self._launch(f"{self.kernel}_adjoint", at, factor=scaled, x_bar=bar.positions, **others)
 
@@ -121,15 +119,13 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """A reward term: the fraction of the fluid in boxes, as a smooth function of particle positions. The weight of a
-    particle is 1 inside a box and 1/2 at the distance ``width`` from the nearest box. Outside the boxes the gradient of
-    the weight is therefore not 0."""
+    """A reward term: the fraction of the fluid in boxes, as the mean of 1 / (1 + e^2 / w^2) over particles. The
+    distance from the nearest box is e, and the ``width`` is w."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """Set the boxes, and the ``width`` [m] of the smooth transition around them. If a ``solid`` is given, the boxes
-        move with the solid. The solid may turn only about z."""
+        """``width`` [m] is the width of the transition. Boxes move with a ``solid``, which turns only about z."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -188,8 +184,7 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """A reward term: the weighted sum of squared distances of particles from their targets in the current step.
-    Periodic images are ignored."""
+    """A reward term: the weighted sum of squared distances of particles from their targets in a step."""
 
     kernel = "missed"
 
@@ -281,15 +276,12 @@ class Reward:
 
 @dataclass(frozen=True)
 class MinusReward:
-    """The loss of one step, which is minus its reward."""
-
     reward: Reward
     goal: NDArray
     step: int
 
     @property
     def fingerprint(self) -> str:
-        """Return a text that identifies the loss and its step, for checkpoints."""
         return f"{[(weight, type(term).__name__) for weight, term in self.reward.terms]} {self.goal} {self.step}"
 
     def value(self, end: Snapshot) -> float:

@@ -65,8 +65,7 @@ class Ensemble:
         keep_own(self, "spread")
 
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
-        """Return the ensemble around the parameters of a problem. Different numbers ``draw`` give independent samples.
-        Raises `InputError` for a batch, for no parameters, and for spreads below round-off."""
+        """Return the ensemble around the parameters. Different numbers ``draw`` give independent samples."""
         if problem.simulation.batch is not None:
             said = f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene"
             raise InputError(f"{said}, whose samples it runs in batches of its own.")
@@ -92,7 +91,6 @@ class Ensemble:
         return evaluated(problem, points, self.executor if observe is None else InProcess(), observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:
-        """Raise `InputError` if the memory is too small for ``runs`` results with ``numbers`` components each."""
         require({f"{runs:,} runs of {self.samples:,} samples": runs * (_RUN + 8.0 * numbers)}, "take fewer samples")
 
 
@@ -121,8 +119,7 @@ class Sampler:
         return self.position_noise * self.random.standard_normal(self.start.shape)
 
     def sample(self, u: np.ndarray, displacement: np.ndarray, estimator: GradientEstimator | None = None) -> Point:
-        """Move the parameters by ``u`` (numbers,) times their spreads, displace the initial positions, and return the
-        sample."""
+        """Return the sample with parameters moved by ``u`` (numbers,) times their spreads."""
         values = _moved(self.values, self.spreads * u)
         if self.position_noise:
             values["initial_positions"] = values.get("initial_positions", self.start) + displacement
@@ -149,8 +146,7 @@ class LeftOutWarning(CortadoWarning):
 
 
 def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
-    """Return a mask (members,) of the members without a failed run, and warn about failed members. If more than a
-    quarter failed, raise the error of the first failed run. ``what`` names the members in the plural."""
+    """Return a mask (members,) of the members without a failed run. ``what`` names members in the plural."""
     errors = [getattr(one, "diverged", None) for one in runs]  # an estimator of one's own may return anything
     lost = np.array([error is not None for error in errors], dtype=bool).reshape(members, -1)
     kept = np.array([not any(member) for member in lost], dtype=bool)
@@ -283,8 +279,7 @@ class EnsembleMean(Ensemble):
         return Estimate(at_them.loss, gradient, error, len(numbers) // 2 - 1, mean, len(samples) - len(checked))
 
     def combined(self, gradients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean of gradients (samples, numbers) and its standard error. Adjacent gradients are antithetic
-        pairs."""
+        """Return mean and standard error of gradients (samples, numbers) in antithetic pairs."""
         return mean_and_error((gradients[::2] + gradients[1::2]) / 2.0)
 
 
@@ -294,8 +289,7 @@ def require_pairs(samples: int) -> None:
 
 
 def mean_and_error(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the samples and its standard error, computed without overflow. The results are NaN for
-    infinite samples."""
+    """Return the mean and its standard error without overflow, or NaN for infinite samples."""
     size = np.abs(samples).max(initial=0.0)
     unit = size if 0.0 < size < np.inf else 1.0
     with np.errstate(invalid="ignore"):

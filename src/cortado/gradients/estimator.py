@@ -102,9 +102,8 @@ class Batchable(Protocol):
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at several points, computed in one launch. All points have the same parameter names and
-        shapes. The results are bitwise equal to separate runs. Without an estimator the estimates have only the loss.
-        For a point with a lost particle, the result is the error."""
+        """Return estimates at points with equal parameter names and shapes. The results are bitwise equal to separate
+        runs. The result for a point with a lost particle is its error."""
 
 
 class GradientEstimator(Protocol):
@@ -115,7 +114,6 @@ class GradientEstimator(Protocol):
 
 
 def checked_estimator(estimator: GradientEstimator) -> GradientEstimator:
-    """Return the estimator. Raises `InputError` for any object that is not an estimator, such as a class."""
     require_methods("estimator", estimator, ("estimate",), "an object such as cortado.gradients.Exact()")
     return estimator
 
@@ -128,8 +126,7 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """Return the result of an estimator in float64. Raises `InputError` if a parameter has no gradient, or a gradient
-    of wrong shape. In a batch the first axis of a gradient is the scene."""
+    """Return an estimate in float64. In a batch the first axis of a gradient is the scene."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -150,8 +147,7 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """True if the estimator can differentiate batches. A subclass may override this property if its gradients never
-        mix scenes."""
+        """True if the estimator never mixes the scenes of a batch. A subclass may override this property."""
         return False
 
     @abstractmethod
@@ -208,11 +204,10 @@ class Point:
     errors: tuple[type[Exception], ...] = ()
     """Types of errors that are replaced by a substitute loss."""
     is_sample: bool = False
-    """True for a sample of an ensemble. The estimate of a sample is not checked. An `InputError` mentions that the
-    point is a sample."""
+    """True for a sample of an ensemble, whose estimate is not checked."""
 
     def evaluated(self, problem: Differentiable, observe: Observer | None = None) -> Estimate:
-        """Return the loss and the gradient at the point. Without an estimator the gradient is empty."""
+        """Return the loss and the gradient. Without an estimator the gradient is empty."""
         try:
             if self.estimator is None:
                 return Estimate(problem.value(self.values), {})
@@ -236,7 +231,7 @@ Group = tuple[Point, ...]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A function that evaluates a problem at groups of points. Error messages are the same as for single points."""
+    """A function that evaluates groups of points. Error messages are the same as for single points."""
 
     problem: Differentiable
     observe: Observer | None = None
@@ -261,7 +256,7 @@ def evaluated(
     observe: Observer | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Compute estimates at points with an executor, and return them in order. One launch evaluates many points."""
+    """Return estimates at points, in order. One launch evaluates many points."""
     firsts = [0]
 
     def kind(point: Point) -> tuple[Any, ...]:

@@ -25,8 +25,7 @@ STRONGEST = 0.6
 
 @cache
 def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
-    """Build the kernels of `AdjointViscosity`, in the notation of its docstring. The order of launches is ``crowd``,
-    ``strength``, ``sort`` and ``viscosity``."""
+    """Build the kernels of `AdjointViscosity`, in the notation of its docstring."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, per_size = pair.weight, pair.per_size
@@ -53,8 +52,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def crowd(s, x, most):
-        """Store the sum of the smoothing kernel over the neighbours, but at least the kernel at half the support
-        radius."""
+        """Store the kernel sum max(S_i, W(h / 2))."""
         i = s.first + wp.tid() // LANES
         total = weights(i, x, s) - real(s.filling[i]) * s.self_weight
         if lane() > 0:
@@ -90,7 +88,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def squares(a, b, found):
-        """Store the squared lengths of two vector fields in float64. The squares may overflow float32."""
+        """Store squared lengths in float64, because squares may overflow float32."""
         i = wp.tid()
         a_i = wp.vec3d(a[i])
         b_i = wp.vec3d(b[i])
@@ -99,8 +97,7 @@ def adjoint_filter_kernels(discretisation: Discretisation) -> Any:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def limit(times: wp.float64, particles: int, squares, sums, strengths, a, b):
-        """Limit the lengths of the adjoint vectors a and b. ``sums`` has the sum of ``squares`` for each scene. A scene
-        without strain is not limited."""
+        """Limit the lengths of a and b. ``sums`` has the sum of ``squares`` for each scene."""
         i = wp.tid()
         if strengths[i // particles] == real(0.0):
             return
@@ -274,8 +271,7 @@ class AdjointViscosity(AdjointEstimator):
         return _ViscousStep(step, rollout, self) if self.coefficient > 0.0 else step
 
     def back(self, forward_pass: ForwardPass, observe: Observer | None = None) -> Arrays:
-        """Return the gradient of a forward run's loss. ``observe`` is called only in the pass with the smaller
-        coefficient."""
+        """Return the gradient. Only the pass with the smaller coefficient calls ``observe``."""
         once = replace(self, order=1)
         gradient = forward_pass.back(once, observe)
         if self.order == 1:
@@ -285,8 +281,6 @@ class AdjointViscosity(AdjointEstimator):
 
 
 class _ViscousStep(Filtered):
-    """A backward step that smooths and limits the adjoints, as in `AdjointViscosity`."""
-
     only_launches = True
 
     def __init__(self, base: BackwardStep, rollout: Rollout, estimator: AdjointViscosity):

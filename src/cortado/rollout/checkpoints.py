@@ -30,18 +30,13 @@ class Checkpoints:
 
     @staticmethod
     def interval(steps: int, affordable: int) -> int:
-        """Return the smallest number of steps between checkpoints that keeps at most ``affordable`` states in memory.
-
-        The stored states are the checkpoints, and the states between two checkpoints. If no interval suffices, return
-        about the square root of ``steps``.
-        """
+        """Return the smallest interval that keeps at most ``affordable`` states, or about sqrt(steps)."""
         if steps <= affordable:
             return 1
         intervals = range(1, isqrt(steps) + 2)
         return next((n for n in intervals if -(-steps // n) + n <= affordable), isqrt(steps) + 1)
 
     def keep(self, step: int, chunk: list[State], series: StateSeries, length: int, spare: list[StateSeries]) -> None:
-        """Store every ``interval``-th state of a chunk of steps."""
         numbers = [n for n in range(step + 1, step + len(chunk) + 1) if n % self._interval == 0]
         if len(numbers) == length:
             copy = spare.pop() if spare else series.like()
@@ -55,8 +50,7 @@ class Checkpoints:
             self._states[n] = partial(_itself, state)
 
     def state(self, n: int, next_state: Callable[[int, State], State]) -> State:
-        """Return state ``n``. A state between checkpoints is recomputed by ``next_state(m, state m)``. ``n`` must
-        decrease from call to call."""
+        """Return state ``n``. ``n`` must decrease from call to call. ``next_state`` recomputes a missing state."""
         if n not in self._states:
             for m in range(n - n % self._interval, n):
                 self._states[m + 1] = partial(_itself, next_state(m, self._states[m]()))
@@ -85,8 +79,7 @@ class Progress:
     """Diagnostics (steps,) of the earlier steps, by name."""
 
     def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
-        """Return the first state of the resumed run, its step number, and True if the run ends there. Raises
-        `InputError` if ``keep`` is true and an earlier process took steps."""
+        """Return the first state of the resumed run, its step number, and True if the run ends there."""
         if self.state is None:
             return initial, 0, False
         if keep:
@@ -120,8 +113,7 @@ class ChunkReader(Protocol):
 
 
 def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:
-    """Return the error for a lost particle of scene ``member``. ``known`` are the last states, up to the state before
-    the failed step."""
+    """Return the error for a lost particle. ``known`` ends with the state before the failed step."""
     containment, particles = solver.containment, solver.layout.particles
     spacing, d = containment.walled.spacing, containment.walled.dimension
     own = slice(member * particles, (member + 1) * particles)

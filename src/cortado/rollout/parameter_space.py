@@ -56,8 +56,7 @@ class ParameterSpace:
         self._have_checks = any(hasattr(maker, "check") for maker in simulation.forces)
 
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
-        """Return values as float64 arrays. Raises `InputError` for invalid values. With ``what`` "direction", negative
-        values are valid."""
+        """Return valid values as float64 arrays. With ``what`` "direction", negative values are valid."""
         if not isinstance(values, Mapping):
             raise InputError(f"{what}s are {shown(values)}, but must be a table by name, such as {{'gravity': value}}.")
         for view, name in self._known.views.items():
@@ -69,7 +68,7 @@ class ParameterSpace:
         return found
 
     def _judge(self, values: Arrays) -> None:
-        """Raise `InputError` or warn if a run with these values would fail. Unchanged values are not checked again."""
+        """Check values for a run. Unchanged values are not checked again."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()
         gravity = values.get("gravity")
@@ -102,12 +101,11 @@ class ParameterSpace:
         return different if len(different) > 1 else different * (self._batch or 1)
 
     def defaults(self) -> Arrays:
-        """Return the scene's values of all parameters. Parameters over time have a first axis for the steps."""
+        """Return the scene's parameters. Parameters over time have a first axis for the steps."""
         found = {**scene_values(self._simulation, self._known), **self._one.scheduled({})}
         return {name: value for name, value in found.items() if self._known[name].role is not Role.CLOCK}
 
     def depends_on_time(self, values: Arrays) -> bool:
-        """Test if the time steps or the scheduled parameters depend on the time of the state."""
         courses = self._one.courses(values).values()
         still = [isinstance(course, Steady) and course.greatest() == 0.0 for course in courses]
         return self._simulation.scene.solver.chooses or not all(still)
@@ -124,10 +122,7 @@ class ParameterSpace:
         states: Sequence[RestartState] = (),
         write: Callable[[State], None] | None = None,
     ) -> None:
-        """Set the first state and the parameters of a rollout. ``values`` replace the scene's values.
-
-        ``varied`` names the parameters for derivatives. ``states`` replace the scene's first state.
-        """
+        """Set the first state and parameters of a rollout. ``varied`` names parameters for derivatives."""
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if write is not None and self._goes_on(rollout, values, varied, states):
             self._go_on(rollout, members, states, write)
@@ -211,7 +206,6 @@ class ParameterSpace:
 
     @cached_property
     def _is_still(self) -> bool:
-        """Test if the scene has no scheduled parameters, no emitters and no moving solids."""
         scene = self._simulation.scene
         return not (self.depends_on_time({}) or scene.emitter or any(table.moves for table in scene.solid))
 
@@ -221,7 +215,6 @@ class ParameterSpace:
             warn(sentence)
 
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
-        """Raise `InputError` unless the restart states of all scenes fit this simulation and ``values``."""
         for name in self._known.state if states else ():
             if name in values:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
@@ -232,8 +225,7 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """Return tangents of the first state and of the parameters along a direction. ``along`` maps names of
-        parameters to tangents. The next call overwrites the tangents of the parameters."""
+        """Return tangents of the first state and of parameters. The next call overwrites the second result."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]
@@ -250,11 +242,7 @@ class ParameterSpace:
         parameters: Parameters,
         time_dots: np.ndarray | None = None,
     ) -> None:
-        """Write the tangents of the first state to ``dot``, and the tangents of the parameters to ``parameters``.
-        ``along`` maps names of parameters to tangents.
-
-        ``time_dots`` (members,) are tangents of the times of the first states.
-        """
+        """Write tangents to ``dot`` and ``parameters``. ``time_dots`` (members,) are tangents of first times."""
         members, times = self.members(values), np.zeros(len(rollout.clocks)) if time_dots is None else time_dots
         each = zip(members, self.members(along), rollout.clocks, times, strict=True)
         directions = [self._one.direction(*own) for own in each]
@@ -263,14 +251,13 @@ class ParameterSpace:
         parameters.set(stacked([run for _, run in directions]))
 
     def time_adjoints(self, rollout: Rollout, values: Arrays, parameters: Parameters) -> np.ndarray:
-        """Return the adjoints (members,) of the times of the first states, given the adjoints of the parameters."""
+        """Return the adjoints (members,) of the times of the first states."""
         run = self._read(parameters, {name for own in self._different(values) for name in self._one.changing(own)})
         members = enumerate(zip(self.members(values), rollout.clocks, strict=True))
         return np.array([self._one.time_adjoint(own, entry(run, b), clock) for b, (own, clock) in members])
 
     def state_adjoint(self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters) -> Arrays:
-        """Return the adjoint of the first state, including ``time``, as float64 arrays by field name. For a batch, each
-        array has a first axis for the scenes."""
+        """Return the adjoint of the first state and its ``time``, in float64."""
         found = {name: bar.astype(np.float64) for name, bar in state.numpy(self._simulation.dimension).items()}
         times = self.time_adjoints(rollout, values, parameters)
         return {**found, STATE_TIME: times[0] if self._batch is None else times}
@@ -278,8 +265,7 @@ class ParameterSpace:
     def gradient(
         self, rollout: Rollout, values: Arrays, state: State, parameters: Parameters, elsewhere: Collection[str] = ()
     ) -> Arrays:
-        """Return the gradient with respect to ``values``, given adjoints of the first ``state`` and of the parameters.
-        For a batch, each array has a first axis for the scenes. Parameters in ``elsewhere`` are omitted."""
+        """Return the gradient by name, without the parameters in ``elsewhere``."""
         dimension = self._simulation.dimension
         read = {self._known.views.get(name, name) for name in values}
         read |= set(self._known.over_time) if "time_step" in values else set()
@@ -334,8 +320,6 @@ class ParameterSpace:
         return [shared | {name: value[b] for name, value in each.items()} for b in members]
 
     def _check(self, values: Arrays, number: int) -> None:
-        """Raise `InputError` for invalid values of a scene. Warn if time steps exceed limits of stability, or if first
-        positions are too close together."""
         simulation = self._simulation
         if self._steps == 0:
             return
@@ -358,8 +342,7 @@ class ParameterSpace:
 
 
 def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, values: Mapping[str, Any]) -> int:
-    """Return the number of steps of a run, from either ``steps`` or ``time`` [s]. With adaptive steps the number is an
-    upper bound. Raises `InputError` unless exactly one of ``steps`` and ``time`` is given."""
+    """Return the number of steps, or an upper bound for adaptive steps. ``time`` is in s."""
     if steps is None and time is None:
         raise InputError("steps is left out, but must be given, as no time is given.")
     if steps is not None and time is not None:

@@ -1,8 +1,7 @@
 """The time loop: forward runs, checkpoints and backward passes.
 
 Steps are launched in chunks. After a chunk, the host checks for lost particles, and repeats the chunk if neighbour
-lists were too short. On a GPU, a chunk of forward steps is a captured graph, and so is one step of forward or reverse
-mode. Graphs are also used on a CPU if launches use one thread.
+lists were too short.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -40,7 +39,7 @@ class BackwardStep(Protocol):
     """Protocol of the backward pass through one step, made by an `AdjointEstimator`."""
 
     capturable: bool
-    """True if the backward step may be captured as a CUDA graph."""
+    """True if a CUDA graph may capture the backward step."""
     rollout: "Rollout"
     solver: Solver
     """Solver that repeats the forward step."""
@@ -77,8 +76,7 @@ class AdjointStep:
 
 
 class Rollout(Staying):
-    """Steps of a solver from a first state, which can be repeated and differentiated. ``steps`` may be changed between
-    evaluations, up to ``room``."""
+    """Steps of a solver from a first state. ``steps`` may change between evaluations, up to ``room``."""
 
     instead = "but the simulation that it is of can"
 
@@ -95,10 +93,8 @@ class Rollout(Staying):
         self.clocks = [Clock()] * solver.layout.members
         self.origins: list[Origin] = []
         self.lost: dict[int, DivergedError] = {}
-        """Errors of the scenes of a batch that lost a particle in the last forward run."""
         self.log = solver.new_log(steps)
         self.step_sizes = StepSizes()
-        """Lengths of the time steps."""
         self.progress, self.taken = Progress(), 0
         state_bytes = sum(self.initial[f.name].capacity for f in self.initial.fields if not f.is_constant)
         self._interval = Checkpoints.interval(steps, within(memory_budget, self._device) // state_bytes)
@@ -117,7 +113,7 @@ class Rollout(Staying):
         self.longest_chunk, self.goes_on = length, False
         self._copies = [*solver.copies, *(self.log.copies if steps <= length else ())]
         self.evaluation = 0
-        """Number of the current evaluation. It increases with every new first state and with new parameters."""
+        """Number of the evaluation. Every new first state or parameter begins an evaluation."""
         self._evaluations = count(1)
         self.pending: WeakSet[Residual] = WeakSet()
         self.aside: list[tuple[State, StepLog]] = []
@@ -246,7 +242,6 @@ class Rollout(Staying):
             copy.is_fetched = is_fetched
 
     def _length(self, left: int) -> int:
-        """Return the number of steps of the next chunk."""
         length = min(len(self._chunk), self.step_sizes.longest_chunk, left)
         return length if self.steps == self.room or length < left else 1 << (length.bit_length() - 1)
 
@@ -370,10 +365,8 @@ REPLACED = *OF_RUNS, "clocks", "origins", "substeps", "advice", "goes_on", "eval
 
 
 class Residual:
-    """Data of one evaluation of a rollout. With these data, a backward pass is possible after later evaluations.
-
-    Before the next evaluation begins, the first state, the parameters and the log are copied to the residual.
-    """
+    """Data for a backward pass after later evaluations. Before the next evaluation begins, the first state, the
+    parameters and the log are copied to the residual."""
 
     def __init__(self, rollout: Rollout):
         self.rollout, self.turn = rollout, rollout.turn

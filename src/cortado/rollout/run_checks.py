@@ -1,8 +1,4 @@
-"""Checks of the input of a run, and warnings after it.
-
-The input is parameters, first positions, paths of solids, and restart states. Warnings tell of unconverged pressure,
-divergent flow, empty emitters and lost scenes.
-"""
+"""Checks of the input of a run, and warnings after it."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
@@ -34,7 +30,6 @@ from cortado.sph.viscous_solve import Solve
 
 
 def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
-    """Raise `OutOfRangeError` for numbers that the precision cannot represent."""
     for name, value in values.items():
         size = np.abs(value)
         if size.max(initial=0.0) > precision.greatest:
@@ -46,7 +41,7 @@ def check_sizes(values: Arrays, precision: Precision, known: Known) -> None:
 
 
 def check_places(values: Arrays, scene: Scene, free: int) -> None:
-    """Raise `InputError` if an emitter's opening or one of the first ``free`` particles is outside the container."""
+    """Check that emitters' openings and the first ``free`` particles are in the container."""
     spacing = scene.discretisation.spacing
     if "initial_positions" in values and scene.forces.pressure:
         positions = values["initial_positions"]
@@ -78,8 +73,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
-    """Return a warning about the strictest exceeded stability limit, or None. Limits in ``told`` are ignored, and
-    exceeded limits are added to ``told``."""
+    """Return a warning about an exceeded limit of stability, or None. Exceeded limits are added to ``told``."""
     if scene.solver.time_step == "auto":
         return None
     time_step = float(values.get("time_step", scene.solver.time_step))
@@ -93,7 +87,7 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
-    """Return the indices of points (n, d) [m] outside the container."""
+    """Return indices of points (n, d) [m] outside the container."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
@@ -103,8 +97,7 @@ class FirstPositions:
         self._judged: dict[int, NDArray] = {}
 
     def check(self, values: Arrays, member: int) -> str | None:
-        """Return a warning if first positions are too close together, or None. Raises `InputError` if two particles
-        coincide or would fly apart."""
+        """Return a warning about particles that are too close together, or None."""
         if "initial_positions" not in values:
             return None
         simulation, positions = self._simulation, values["initial_positions"]
@@ -134,8 +127,7 @@ SCALES = (0.6, 1.5)
 
 
 def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, courses: dict[str, Changing]) -> str | None:
-    """Return a sentence about the first invalid path or scale of a solid or nozzle, or None. ``run`` has the values of
-    all time steps."""
+    """Return a sentence about the first invalid path or scale, or None. ``run`` has values of all steps."""
     spacing, furthest = scene.discretisation.spacing, FURTHEST * scene.discretisation.spacing * (1.0 + 1e-6)
     if wrong := _stretched(scene, values):
         return wrong
@@ -165,7 +157,6 @@ def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, cours
 
 
 def _stretched(scene: Scene, values: Arrays) -> str | None:
-    """Return a sentence about the first solid with an invalid scale, or None."""
     (least, most), periods = SCALES, scene.periods[1]
     for table in told(scene.solid):
         scale = float(values.get(scale_name(table.name), 1.0))
@@ -204,8 +195,7 @@ def origin_of(simulation: Simulated, rest_density: NDArray) -> Origin:
 
 
 def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int | None) -> list[RestartState]:
-    """Return a list with a restart state for each scene, or an empty list for None. Raises `InputError` for a wrong
-    number or type."""
+    """Return a restart state for each scene, or an empty list for None."""
     if state is None:
         return []
     states = list(state) if isinstance(state, Sequence) and not isinstance(state, str) else [state]
@@ -224,15 +214,14 @@ def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) ->
 
 
 def shapes_of_fields(simulation: Simulated, batch: int | None = None) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a state's fields by name. A ``batch`` adds a first axis for the scenes."""
+    """Return the shapes of a state's fields. A ``batch`` adds a first axis for the scenes."""
     sizes = len(simulation.positions), simulation.dimension, len(simulation.scene.phase)
     members = () if batch is None else (batch,)
     return {field.name: (*members, *field.shape(*sizes)) for field in simulation.initial.fields}
 
 
 def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> None:
-    """Raise `InputError` unless a restart state matches the simulation and the ``origin`` of its particles. For states
-    in `Simulated.judged_states` only the origin is compared."""
+    """Check a restart state. For a state in ``simulation.judged_states`` only the origin is compared."""
     if state.origin is not None and state in simulation.judged_states:
         _check_origin(state.origin, origin)
         return
@@ -320,7 +309,6 @@ def _listed(value: object) -> str:
 
 
 def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) -> None:
-    """Raise `InputError` unless reference densities (n,) match the rest densities."""
     if (found <= 0.0).any():
         raise InputError("state reference_density must be greater than 0.")
     volumes = found * (fractions / rest_density).sum(axis=1)
@@ -337,7 +325,6 @@ def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) 
 
 
 def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
-    """Raise `InputError` if the distances of particles (n, d) do not match the spacing."""
     if len(positions) < 2 or not simulation.scene.forces.pressure:
         return
     spacing = simulation.scene.discretisation.spacing
@@ -380,7 +367,6 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
 
 
 def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
-    """Return a warning with the number of steps in which the pressure did not converge, and advice."""
     advice = "try a smaller time step, more iterations or a larger tolerance."
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
@@ -393,8 +379,6 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
 
 
 def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> str | None:
-    """Return a warning about the step with the greatest divergence of the velocity, or None if few steps
-    exceed `TORN`."""
     found = diagnostics.get("divergence", np.zeros(0))
     if not (found > TORN).any():
         return None
@@ -411,7 +395,7 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
-    """Return a warning about the first emitter that runs out of fluid before the end of the run, or None."""
+    """Return a warning about the first emitter that runs out of fluid before the end, or None."""
     spacing, clock = scene.discretisation.spacing, rollout.clocks[0]
     taken = rollout.taken if scene.solver.chooses else rollout.steps
     times = clock.times(np.arange(taken + 1), float(rollout.time_steps.max()))

@@ -27,7 +27,6 @@ from cortado.solvers.build import ForceMaker
 from cortado.solvers.solver import Solver
 
 DENSITY = "reference_density"
-"""Name of the state field with the reference density."""
 COMPOSITION = ("mass_fractions", "rest_density")
 
 
@@ -43,9 +42,8 @@ class Simulated(Source, Protocol):
     precision: Precision
     smoothing: SmoothingKernel
     lattice: Lattice
-    """Constants of the rest lattice."""
     free_particles: int
-    """Number of particles outside emitters. In arrays, these particles come before the particles of emitters."""
+    """Number of particles outside emitters, which come first in arrays."""
 
     @property
     def dimension(self) -> int: ...
@@ -54,12 +52,13 @@ class Simulated(Source, Protocol):
     def carried_by(self) -> str | None:
         """Name of the solver if the solver adds fields to states, or None."""
 
-    def substeps(self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray) -> int:
-        """Return the number of diffusion substeps in a step that keeps diffusion stable."""
+    def substeps(
+        self, time_step: NDArray, mobility: NDArray, interface_width: NDArray, rest_density: NDArray
+    ) -> int: ...
 
 
 class SceneParameters:
-    """Converts the parameters of a scene by name to the arrays of a run, with tangents and adjoints."""
+    """Converts the parameters of a scene to the arrays of a run, with tangents and adjoints."""
 
     def __init__(self, simulation: Simulated, steps: int):
         self._simulation, self._steps, self._known = simulation, steps, simulation.known
@@ -78,7 +77,7 @@ class SceneParameters:
         return {**values, "gravity": self._tilt.gravity(values["tilt"])} if "tilt" in values else values
 
     def courses(self, values: Arrays) -> dict[str, Changing]:
-        """Return the scheduled parameters that are not replaced in ``values``, as functions of time."""
+        """Return the scheduled parameters that are not in ``values``, as functions of time."""
         replaced = {"gravity", "tilt"} if not values.keys().isdisjoint(("gravity", "tilt")) else set()
         courses = {**self._scheduled, **self._known.courses}
         found = {name: course for name, course in courses.items() if name not in values and name not in replaced}
@@ -98,8 +97,8 @@ class SceneParameters:
         return np.arange(max(self._steps, 1)) + self._known[name].moment
 
     def _scheduled_rates(self, values: Arrays, clock: Clock | None, of_clock: bool = False) -> Arrays:
-        """Return the derivatives (steps, ...) of the scheduled parameters with respect to the time step. With
-        ``of_clock``, return the derivatives with respect to the time of the clock."""
+        """Return the derivatives (steps, ...) of scheduled parameters by the time step or, with ``of_clock``, by the
+        time."""
         found = {}
         for name, course in self.courses(values).items():
             times, moments = self._times(name, values, clock), self._moments(name)
@@ -112,8 +111,7 @@ class SceneParameters:
         return found
 
     def scheduled(self, values: Arrays, clock: Clock | None = None) -> Arrays:
-        """Return the values (steps, ...) of the scheduled parameters that are not replaced in ``values``. A scheduled
-        tilt is returned as gravity."""
+        """Return scheduled parameters (steps, ...) that are not in ``values``, with tilt as gravity."""
         rows = {name: course.at(self._times(name, values, clock)) for name, course in self.courses(values).items()}
         return {name: value for name, value in self.upright(rows).items() if name in self._known.run}
 
@@ -124,8 +122,7 @@ class SceneParameters:
         return {name: value[0] for name, value in self.upright(rows).items() if name in self._known.run}
 
     def run(self, values: Arrays) -> Arrays:
-        """Return the parameters of all time steps. ``values`` replace the scene's values. Parameters over time have the
-        shape (steps, ...), parameters of phases (phases,)."""
+        """Return parameters over time (steps, ...) and parameters of phases (phases,)."""
         known = self._known
         found = {name: values.get(name, self.values[name]) for name in known.run}
         for name, value in found.items():
@@ -137,8 +134,7 @@ class SceneParameters:
         return found
 
     def first(self, values: Arrays) -> Arrays:
-        """Return the fields of the first state that depend on ``values``. Raises `InputError` if mass fractions give a
-        particle no volume."""
+        """Return the fields of the first state that depend on ``values``."""
         fields = first_values(self._simulation.initial.fields, values)
         if values.keys().isdisjoint(COMPOSITION):
             return fields
@@ -156,8 +152,7 @@ class SceneParameters:
     def direction(
         self, values: Arrays, along: Arrays, clock: Clock | None = None, time_dot: float = 0.0
     ) -> tuple[Arrays, Arrays]:
-        """Return tangents of the first state's fields and of the parameters of all time steps. ``along`` maps names of
-        parameters to tangents, and ``time_dot`` is the tangent of the clock's time."""
+        """Return tangents of the first state and of all steps. ``time_dot`` is the clock's tangent."""
         for view, replaced in self._known.views.items():
             for name, other in ((view, replaced), (replaced, view)):
                 if name in along and other in values:
@@ -190,13 +185,12 @@ class SceneParameters:
         return {"gravity" if name == "tilt" else name for name in self.courses(values)}
 
     def time_adjoint(self, values: Arrays, run: Arrays, clock: Clock) -> float:
-        """Return the adjoint of the clock's time, given the adjoints ``run`` of the parameters of all time steps."""
+        """Return the adjoint of the clock's time, given the adjoints ``run`` of all steps."""
         rates = self._scheduled_rates(values, clock, of_clock=True)
         return sum((float((run[name] * rate).sum()) for name, rate in rates.items()), 0.0)
 
     def gradient(self, values: Arrays, first: Arrays, run: Arrays, clock: Clock | None = None) -> Arrays:
-        """Return the gradient with respect to ``values``. ``first`` are the adjoints of the first state's fields, and
-        ``run`` the adjoints of the parameters of all time steps. Parameters without an adjoint are omitted."""
+        """Return the gradient from the adjoints of the ``first`` state and of the ``run``'s parameters."""
         found = {name: run[name].copy() for name in self._known.run if name in values and name in run}
         for field in self._simulation.initial.fields:
             if field.first in values and field.name in first:

@@ -1,8 +1,4 @@
-"""Bounds on the time steps of a run, and the expected number of steps.
-
-The bounds do not depend on the speed of the fluid. They follow from the scene, scheduled gravity and the paths of
-emitters and solids.
-"""
+"""Bounds on time steps that do not depend on the speed of the fluid, and the expected number of steps."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,8 +36,7 @@ the axis [m] for a rotation."""
 
 
 def greatest_step(scene: SceneTables, values: Arrays) -> float:
-    """Return the longest possible time step [s] for any gravity. Raises `InputError` if nothing limits the
-    time step."""
+    """Return the longest possible time step [s] for any gravity."""
     found = min(chosen_limits(scene, values).values())
     if not np.isfinite(found):
         raise InputError(
@@ -52,8 +47,7 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
 
 
 def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0.0) -> NDArray:
-    """Return upper bounds of the time steps (steps,) [s], for the gravity of each step in ``values``. Raises
-    `InputError` for a bound below ``least`` [s]."""
+    """Return upper bounds of the time steps (steps,) [s] for the gravity in ``values``. ``least`` is in s."""
     bounds = np.full(max(steps, 1), greatest_step(scene, values))
     if "gravity" in values:
         limits = gravity_limits(scene, np.atleast_2d(values["gravity"])).values()
@@ -101,7 +95,7 @@ class Travel:
         return cls(times, speeds, lengths, furthest, LEAST * greatest_step(scene, values))
 
     def longest(self, time: float) -> float:
-        """Return the longest allowed time step [s] from ``time`` [s] on. It is infinite after the end of all paths."""
+        """Return the longest time step [s] from ``time`` [s] on, which is infinite after all paths."""
         reached = float(self.at(time)) + self.furthest
         k = int(np.searchsorted(self.lengths, reached, side="right")) - 1
         if self.speeds[k] == 0.0:
@@ -114,8 +108,7 @@ class Travel:
         return np.asarray(np.interp(np.asarray(times), self.times, self.lengths))
 
     def steps(self, duration: float, longest: float) -> float:
-        """Return an upper bound on the number of time steps that the paths add to ``duration`` [s]. Without paths, time
-        steps have the length ``longest`` [s]."""
+        """Return an upper bound on the steps that paths add. ``duration`` and ``longest`` are in s."""
         begins = np.concatenate([self.times, self.times - duration])
         way = float((self.at(begins + duration) - self.at(begins)).max())
         with np.errstate(divide="ignore"):
@@ -125,8 +118,7 @@ class Travel:
 
 
 def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) -> dict[str, Callable[[float], float]]:
-    """Return the bounds on time steps from paths and from scheduled gravity or tilt. The keys are phrases for messages.
-    The values are functions of a time [s]. They return the longest time step [s] from then on."""
+    """Return functions that map a time [s] to the longest next step [s]. The keys are phrases for messages."""
     courses, greatest = parameters.courses(values), greatest_step(scene, values)
     upright: dict[str, Any] = {"gravity": np.asarray, "tilt": Tilt(scene.forces.gravity).gravity}
     travel = Travel.of(scene, values, moved_by(scene, values, courses).values())
@@ -145,8 +137,7 @@ def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) 
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Make a rollout use adaptive time steps. Before this call, set the clocks and first states. ``members`` has the
-    parameter values of each scene."""
+    """Make a rollout use adaptive time steps. Before this call, set the clocks and first states."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius
@@ -169,8 +160,7 @@ def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, 
 
 
 def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
-    """Estimate the number of time steps of a run over ``time`` [s]. The estimated fluid speed is the speed after a fall
-    through the container. Raises `InputError` above `MOST` steps."""
+    """Estimate the number of steps in ``time`` [s], for fluid that has fallen through the container."""
     scene = simulation.scene
     courant = COURANT if scene.solver.courant is None else scene.solver.courant
     limits = stability_limits(scene, values)
@@ -182,24 +172,22 @@ def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
 
 
 def counted_steps(time: float, steps: float) -> int:
-    """Round a number of steps up to a whole number of at least 1. Raises `InputError` above `MOST`."""
     if steps > MOST:
         raise InputError(f"time is {time:g} s, but must be less, as that takes about {steps:.2g} steps.")
     return max(ceil(steps), 1)
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
-    """Return an upper estimate of the number of frames of a run with a frame every ``record_every`` steps."""
+    """Return an upper estimate of the number of frames."""
     return 2 + rollout.steps // (ROOM if ends_at_a_time(rollout) else 1) // record_every
 
 
 def ends_at_a_time(rollout: Rollout) -> bool:
-    """Test if a rollout ends at a given time instead of after a given number of steps."""
     return bool(np.isfinite(rollout.step_sizes.end))
 
 
 def done_of(rollout: Rollout, step: int, time: float) -> int:
-    """Return the progress of a rollout: the number of steps, or a percentage for a run with a given end time."""
+    """Return the progress: the number of steps, or a percentage for a run to a given end time."""
     if not ends_at_a_time(rollout):
         return step
     begun, end = rollout.clocks[0].time, rollout.step_sizes.end

@@ -1,8 +1,6 @@
 """Lengths of the time steps of a rollout, which are fixed or chosen on the device before each step.
 
-An adaptive step of the projection solver is repeated with a shorter length if it compresses fluid or loses a particle.
-The step keeps its length if a shorter step does not help. The choice depends only on the state before a step. A resumed
-run therefore has the same steps as a run without interruption.
+The choice depends only on the state before a step, so that a resumed run has the same steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,23 +28,21 @@ SHORTER = 0.25
 
 
 class Retaken:
-    """The repeated steps of a run."""
+    """Steps that are repeated with a shorter length, because they compress fluid or lose a particle. A step keeps its
+    length if a shorter step does not help."""
 
     def __init__(self) -> None:
         self._tries: dict[tuple[int, int], tuple[float, list[tuple[float, float]]]] = {}
-        """Shortest length by (step, scene), and the length and increase of compression of each try, which is infinite
-        for a lost particle."""
+        """Shortest length [s], and tried lengths [s] with increases of compression, by (step, scene)."""
         self._settled: set[tuple[int, int]] = set()
 
     def found(
         self, first: int, added: NDArray, sizes: NDArray, longest: NDArray, lost: dict[int, int]
     ) -> dict[tuple[int, int], float]:
-        """Return the new length [s] of the first step that each scene must repeat. The keys of the result are pairs of
-        the step and the scene.
+        """Return the new length [s] of the first step that each scene must repeat, by (step, scene).
 
-        Arrays have the shape (steps, members). ``added`` is the increase of compression, ``sizes`` are the lengths of
-        the steps [s], and ``longest`` are the allowed lengths [s]. ``lost`` maps the number of a scene to the step that
-        lost a particle.
+        Arrays have the shape (steps, members). ``added`` is the increase of compression. ``lost`` maps the number of a
+        scene to the step that lost a particle.
         """
         again = {}
         for member in range(added.shape[1]):
@@ -83,7 +79,6 @@ class Compressions:
         """Increase of compression (steps, members) [-]."""
 
     def measure(self, state: State) -> None:
-        """Record the increase of compression in the step before ``state``."""
         solver, members = self._solver, self._solver.layout.members
         numbers = {"particles": solver.layout.particles, "first_waiting": solver.system.waiting}
         now = {"order": solver.search.order, "n": solver.fields["n"], "x": state.positions}
@@ -102,8 +97,7 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def compare(particles: int, first_waiting: int, order, n, excess, x_free, x, added):
-        """Write the increase of compression of each sorted particle. The compression is max(n - 1, 0) with the number
-        density n."""
+        """Write the increase of the compression max(n - 1, 0), with the number density n."""
         i = wp.tid()
         more = wp.max(excess[i], real(0.0)) - wp.max(n[i] - real(1.0), real(0.0))
         p = order[i]
@@ -130,8 +124,8 @@ LEAST = 1e-6
 
 
 Scheduled = tuple[Callable[[NDArray], NDArray], Callable[[int, NDArray, NDArray], None]]
-"""Two functions: of times (members,) [s], which returns the longest time steps from then on; and of the number, the
-times and the lengths (members,) [s] of a step, which writes its scheduled parameters."""
+"""The first function maps times (members,) [s] to the longest time steps. The second writes the scheduled parameters of
+a step, given its number, times and lengths (members,) [s]."""
 
 
 @dataclass(frozen=True)
@@ -143,39 +137,33 @@ class RecordedSizes:
 
 
 class StepSizes:
-    """The lengths of the time steps of a rollout. In this base class, the lengths are the values of the parameter
-    ``time_step``."""
+    """Fixed lengths of time steps, which are the values of the parameter ``time_step``."""
 
     longest_chunk = 2**31
     """Greatest number of steps between two reads of step lengths."""
     end = inf
     """End time of the run [s], or infinity."""
 
-    def begin_at(self, state: State) -> None:
-        """Choose the length of the first step."""
+    def begin_at(self, state: State) -> None: ...
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Choose the length of the step after ``step`` steps of an earlier process. ``sizes`` (step,) [s] are the
-        earlier lengths. Return True if the run ends with the state."""
+        """Continue after ``step`` steps of lengths ``sizes`` (step,) [s]. Return True if the run ends here."""
         return False
 
-    def choose(self, state: State) -> None:
-        """Choose the length of the step after ``state``."""
+    def choose(self, state: State) -> None: ...
 
     def seek(self, step: int) -> None:
         """Set the solver to the recorded length of a step. The first ``step`` is 0."""
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """Read the lengths of the steps after the states ``first`` to ``last``. Return the number of the last valid
-        state, and True if the run ends with this state."""
+        """Read step lengths. Return the number of the last valid state, and True if the run ends there."""
         return last, False
 
     def again(self, first: int, last: int) -> bool:
-        """Test if a step between the states ``first`` and ``last`` must be repeated with a shorter length."""
+        """Test if a step between two states must be repeated with a shorter length."""
         return False
 
     def is_end(self, step: int) -> bool:
-        """Test if the run ends with the state after ``step`` steps."""
         return False
 
     def of_step(self, step: int) -> NDArray | None:
@@ -183,14 +171,13 @@ class StepSizes:
         return None
 
     def diagnostics(self, steps: int) -> dict[str, NDArray]:
-        """Return diagnostics of the first ``steps`` steps by name: (steps,), or (steps, batch) for a batch."""
+        """Return diagnostics by name: (steps,), or (steps, batch) for a batch."""
         return {}
 
     def recorded(self) -> RecordedSizes | None:
         return None
 
-    def assign(self, recorded: RecordedSizes | None) -> None:
-        """Restore recorded lengths and times."""
+    def assign(self, recorded: RecordedSizes | None) -> None: ...
 
 
 class ChosenSteps(StepSizes):
@@ -213,8 +200,7 @@ class ChosenSteps(StepSizes):
         self._steps, self._retaken = steps, Retaken()
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
-        """Prepare a run with upper bounds (steps, members) [s] of the time steps, and return clocks that
-        record times."""
+        """Prepare a run with upper ``bounds`` (steps, members) [s]. Return clocks that record times."""
         self._steps, room = len(bounds), len(self._bounds)
         self._bounds.assign(np.pad(bounds, ((0, room - len(bounds)), (0, 0)), mode="edge"))
         self._first.assign([clock.time_step for clock in clocks])
@@ -288,7 +274,6 @@ class ChosenSteps(StepSizes):
         return bool(self._read.times[step, 0] >= self.end)
 
     def _look(self, first: int, last: int) -> None:
-        """Read the lengths and times of steps."""
         of = slice(first, last + 1)
         self._read.sizes[of], self._read.times[of] = self._sizes[of].numpy(), self._times[of].numpy()
         if self._scheduled is None:
@@ -322,8 +307,7 @@ class ChosenSteps(StepSizes):
 
 @cache
 def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
-    """Return two kernels: ``speeds`` computes the squared speeds of particles, ``choose`` the time step of
-    each scene."""
+    """Return the kernels ``speeds`` for squared speeds and ``choose`` for time steps."""
     real, pair, vector = precision.real, precision.pair, precision.vector
     module = kernel_module(f"step_sizes_{precision.name}")
     typed = TypesByName(real, {pair: "greatest squares", vector: "v", wp.int32: "step"})
@@ -340,12 +324,8 @@ def step_size_kernels(precision: Precision) -> tuple[Any, Any]:
         length: real, least: real, growth: real, greatest, bounds: wp.array2d(dtype=real), first, step,
         times: wp.array2d(dtype=wp.float64), sizes: wp.array2d(dtype=real), longest: wp.array2d(dtype=real), time_step,
     ):  # fmt: skip
-        """Write the time before the step, and the time step dt of each scene.
-
-        dt is the minimum of three terms: ``bounds``, ``growth`` times the previous dt, and ``length`` divided by the
-        greatest speed. The third term is at least ``least`` times ``bounds``. ``first`` is the dt before the first
-        step, or 0. ``longest`` is dt without the growth term.
-        """
+        """Write dt = min(bounds, growth dt_0, max(length / u, least bounds)) with the greatest speed u. The previous
+        step is dt_0, or ``first`` before the first step. ``longest`` is dt without the growth term."""
         b = wp.tid()
         n = step[b]
         dt = bounds[wp.min(n, bounds.shape[0] - 1), b]

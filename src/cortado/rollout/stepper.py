@@ -1,5 +1,4 @@
-"""Time steps of a simulation as a function of a state and of parameters, with derivatives. The class `Stepping` adds
-the methods to simulations."""
+"""Time steps of a simulation as a function of a state and of parameters, with derivatives."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -61,8 +60,7 @@ class BackwardSteps:
         self._rollout, self._made = rollout, dict[ReverseEstimator | None, BackwardStep]()
 
     def of(self, estimator: ReverseEstimator | None) -> BackwardStep:
-        """Return the backward step of an estimator, by default of the exact estimator. Raises `InputError` if the
-        estimator's settings can change, or if it may mix scenes of a batch."""
+        """Return the backward step of an estimator, by default of the exact estimator."""
         solver = self._rollout.solver
         if estimator is not None:
             wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
@@ -111,8 +109,7 @@ class AdjointGrowth:
         self._warned = False
 
     def follow(self, rollout: Rollout, squares: np.ndarray) -> None:
-        """Add a call to the chain. ``squares`` is the result of `sums_of_squares` for the adjoints of the call's last
-        and first state. Warn once if the growth exceeds `MOST_GROWTH`."""
+        """Add a call. ``squares`` are the `sums_of_squares` of the adjoints of its last and first state."""
         size = float(rollout.time_steps[0])
         start, end = (rollout.clocks[0].after(steps, size).time for steps in (0, rollout.steps))
         into, out = np.sqrt(squares, dtype=np.float64).reshape(2, 2).tolist()
@@ -134,8 +131,7 @@ class AdjointGrowth:
 
 
 def sums_of_squares(*states: State) -> wp.array:
-    """Compute the sum of the squares of the positions and of the velocities of each state. The function does not wait
-    for a GPU."""
+    """Sum the squares of positions and of velocities of each state, without waiting for a GPU."""
     arrays = [array for state in states for array in (state.positions, state.velocities)]
     found = wp.empty(len(arrays), dtype=arrays[0].dtype._wp_scalar_type_, device=arrays[0].device)
     for k, array in enumerate(arrays):
@@ -147,7 +143,6 @@ class Stepper:
     """A fixed number of steps of a simulation, as a function of the first state and of parameters."""
 
     def __init__(self, simulation: Simulated, steps: int):
-        """Prepare ``steps`` steps; the number may be 0."""
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
@@ -193,9 +188,7 @@ class Stepper:
     @in_turn
     def follow(self, state: DeviceState, rows: Arrays) -> DeviceState:
         """Return the state after the steps, with the parameters of the last `advance` and new parameters over time.
-
-        ``rows`` are the values of all parameters over time, (batch, steps, ...). The values are not checked.
-        """
+        ``rows`` (batch, steps, ...) are the values of all parameters over time, and are not checked."""
         place = DeviceStates(self._simulation)
         if self._space.depends_on_time(rows):
             place.begin(self._space, self.rollout, state, dict(rows), set())
