@@ -21,16 +21,14 @@ FURTHEST = 2.0**24
 
 @cache
 def cell_grid_type(precision: Precision) -> Any:
-    """Return the Warp struct of a grid. ``frequency`` is the inverse edge length of a cell [1 / m]. ``starts`` is the
-    index of the first sorted particle in each cell (members cells + 1,)."""
+    """``frequency`` is the inverse cell length [1 / m]. ``starts`` is the first sorted particle of each cell."""
     vectors, starts = dict.fromkeys(("origin", "frequency"), precision.vector), wp.array(dtype=wp.int32)
     return struct_of("CellGrid", precision, **vectors, shape=wp.vec3i, starts=starts)
 
 
 @cache
 def cell_functions(precision: Precision) -> SimpleNamespace:
-    """Build the Warp functions ``wrap`` and ``cell_of``. Also build ``below`` and ``above``, which return the range of
-    neighbouring cells along an axis."""
+    """``below`` and ``above`` give the range of neighbouring cells along an axis with n cells."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 
@@ -63,8 +61,7 @@ def cell_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def cell_kernels(precision: Precision) -> SimpleNamespace:
-    """Build the kernels ``count``, ``place`` and ``rank`` of a counting sort. ``rank`` restores the given order within
-    each cell, because the order of atomic additions is random."""
+    """``rank`` restores the given order within each cell, because the order of atomic additions is random."""
     vector, real = precision.vector, precision.real
     grid_type = cell_grid_type(precision)
     cell_of = cell_functions(precision).cell_of
@@ -80,7 +77,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def count(grid, particles: int, x, counts, arrivals):
-        """Count the particles in each cell. ``counts`` must be 0 before the launch."""
+        """``counts`` must be 0 before the launch."""
         i = wp.tid()
         member = i // particles
         cells = grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -94,7 +91,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def place(arrivals, starts, counts, placed, before):
-        """Write the index of each particle into the sorted array, and reset ``counts`` to 0."""
+        """``counts`` is reset to 0 for the next sort."""
         i = wp.tid()
         arrival = arrivals[i]
         p = starts[arrival[0]] + arrival[1]
@@ -120,8 +117,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
 
 
 class CellSort:
-    """A sort of particles by scene and cell on one device. Lost particles are spread over all cells, because a GPU is
-    slow with many particles in one cell."""
+    """Lost particles are spread over all cells, because a GPU is slow with many particles in one cell."""
 
     def __init__(self, grid: Grid, particles: int, precision: Precision, device: Any, members: int = 1):
         self._particles, self._all, self._device = particles, members * particles, device

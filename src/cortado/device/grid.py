@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid of cells over a region. A cell is at least as wide as the search radius."""
+    """A cell is at least as wide as the search radius."""
 
     origin: np.ndarray
     """Lower corner of cell 0 [m], (3,)."""
@@ -22,8 +22,7 @@ class Grid:
 
     @classmethod
     def around(cls, lower: np.ndarray, upper: np.ndarray, period: np.ndarray, reach: float, most: int) -> "Grid":
-        """Make a grid over the region from ``lower`` to ``upper`` (d,) [m] for a search radius ``reach`` [m]. A grid
-        that would have more than about ``most`` cells wraps around."""
+        """A grid that would need more than about ``most`` cells wraps around. Lengths are in [m]."""
         origin, cell, shape = np.zeros(3), np.full(3, reach), [1, 1, 1]
         for axis in range(len(lower)):
             if period[axis] > 0:

@@ -22,7 +22,6 @@ _FIELDS: dict[Any, tuple[str, ...]] = {}
 
 @cache
 def bundle(**entries: Any) -> Any:
-    """Return the Warp struct of arrays with the given names and element types."""
     words = (f"{name}_{wp.types.type_size_in_bytes(kind)}" for name, kind in entries.items())
     arrays = {name: wp.array(dtype=kind) for name, kind in entries.items()}
     made = wp.struct(type("_".join(("Bundle", *words)), (), {"__annotations__": arrays, "__module__": __name__}))
@@ -43,11 +42,8 @@ Named = Mapping[str, Any]
 
 
 def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, filled: dict[Any, Any] | None = None) -> list[Any]:
-    """Return the arguments of a kernel in the order of its signature. Each argument comes from ``given``, or else from
-    the first of the ``groups`` with the name. Bundles are cached in ``filled``.
-
-    Raises `TypeError` if an argument is missing, or if the kernel has no argument with a name in ``given``.
-    """
+    """Take each argument from ``given``, or else from the first of the ``groups`` that has its name. Bundles are cached
+    in ``filled``."""
     names, arguments = _signature(kernel)
     for name in given:
         if name not in names:
@@ -95,8 +91,7 @@ PARTS_A_CORE = 4
 LEAST_SHARED_PART = 10_000
 
 Watcher = Callable[[str, Any, Sequence[Any], Callable[[], None]], None]
-"""A function that is called instead of a launch. It gets the kernel's name, the number of threads, the arguments, and a
-function that launches the kernel."""
+"""A watcher gets a kernel's name, threads and arguments, and the function that launches the kernel."""
 _watchers: list[Watcher] = []
 
 
@@ -120,8 +115,7 @@ def _perform(name: str, threads: Any, arguments: Sequence[Any], work: Callable[[
 def launch(
     kernel: wp.Kernel, threads: Any, device: Any, *groups: Named, block: int | None = None, **arguments: Any
 ) -> None:
-    """Launch a kernel outside Warp's tape. ``threads`` is a number or a shape. ``block`` is the number of GPU threads
-    that share memory."""
+    """``threads`` is a number or a shape. ``block`` is the number of GPU threads that share memory."""
     announce(kernel, device)
     inputs, sizes = bound(kernel, groups, arguments), {} if block is None else {"block_dim": block}
     work = partial(wp.launch, kernel, threads, inputs=inputs, device=device, record_tape=False, **sizes)
@@ -129,7 +123,6 @@ def launch(
 
 
 def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> Callable[[], None]:
-    """Return a function that launches a kernel with fixed arguments."""
     announce(kernel, device)
     inputs = bound(kernel, (), arguments)
     command = wp.launch(kernel, threads, inputs=inputs, device=device, record_tape=False, record_cmd=True)
@@ -151,15 +144,11 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 
 class KernelLauncher:
-    """A launcher of kernels on one device, with one thread for each particle.
-
-    On a CPU, the cores share the launch of a kernel with the neighbourhood argument ``s``. Each launch covers a range
-    of particles, and the kernel computes particle ``s.first + wp.tid()``. The results do not depend on the number of
-    cores.
-    """
+    """On a CPU, the cores share the launch of a kernel with the neighbourhood argument ``s``. Each launch covers a
+    range of particles, and the kernel computes particle ``s.first + wp.tid()``. The results do not depend on the number
+    of cores."""
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
-        """Prepare launches. If ``record_tape`` is true, an open Warp tape records the launches."""
         self.particles, self.device, self._record_tape = particles, device, record_tape
         self._cores = min(usable_cores(), MOST_CORES) if device.is_cpu and not record_tape else 1
         each = min(PARTS_A_CORE, MOST_PARTS // self._cores, particles // (self._cores * LEAST_SHARED_PART))
@@ -224,12 +213,10 @@ class KernelLauncher:
 
 
 class CapturedGraph:
-    """Launches with fixed arrays that are replayed as a captured graph. Unless ``is_warm`` is true, the first call runs
-    without a graph, because capture forbids loading modules and allocating memory."""
+    """Unless ``is_warm``, the first call runs without a graph, as capture forbids loading modules and allocation."""
 
     def __init__(self, work: Callable[[], None], launch: KernelLauncher, is_warm: bool = False, lends: bool = True):
-        """Prepare to capture ``work``. If ``lends`` is true, other threads may use Warp while a CPU replays the graph,
-        which takes longer than a graph of a few fills."""
+        """With ``lends``, other threads may use Warp while a CPU replays the graph."""
         self._work, self._launch = work, launch
         self._warm, self._graph = is_warm, None
         self._lends = lends and bool(launch.device.is_cpu)  # a GPU has one queue for all threads
@@ -253,8 +240,7 @@ LEAST, LEAST_SHARED_OFTEN = 1_000, 50_000
 
 
 class BandLauncher:
-    """A launcher for any number of threads, which are divided into ranges on a CPU. Kernels compute the value with
-    index ``first + wp.tid()``."""
+    """On a CPU the threads are divided into ranges. Kernels compute the value with index ``first + wp.tid()``."""
 
     def __init__(self, device: Any):
         self.device, self._compiled = device, set[Any]()
@@ -274,8 +260,7 @@ class BandLauncher:
         in_parallel(work, left, cores)
 
     def to_and_fro(self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **given: Any) -> wp.array:
-        """Launch a kernel ``rounds`` times, and swap its input and output array after each launch. Returns the last
-        output."""
+        """Launch a kernel ``rounds`` times, swapping its input and output each time. Return the last output."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
             ways: list[Callable[[], None]] = [partial(self, kernel, count, **given, **one) for one in both]
@@ -306,8 +291,7 @@ class HostCopy:
             wp.copy(self._copy, self._array)
 
     def read(self, rows: int | None = None) -> np.ndarray:
-        """Wait for the device, and return the array or its first ``rows`` elements. The next call overwrites the
-        result."""
+        """Wait for the device. The next call overwrites the result."""
         if not (self._is_cpu or self.is_fetched or rows == 0):
             self.fetch()
             wp.synchronize_stream(self._array.device)

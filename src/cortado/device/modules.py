@@ -45,8 +45,6 @@ def kernel_module(name: str, backward: bool = False) -> Any:
 
 
 class Kernels(NamedTuple):
-    """A Warp kernel or function with its tangent and its adjoint."""
-
     forward: Any
     tangent: Any
     """Kernel of forward mode, which computes the tangents ``x_dot`` of its outputs."""
@@ -60,10 +58,7 @@ def by_name(*made: Any) -> SimpleNamespace:
 
 
 def kind_of(forward: bool, taped: bool) -> str:
-    """Return the kind of kernels for the name of a Warp module: "forward", "taped" or "derivative".
-
-    Kernels for Warp's tape have separate modules, because the adjoints of the kernels take long to compile.
-    """
+    """Kernels for Warp's tape have separate modules, because the adjoints of the kernels take long to compile."""
     if not forward:
         return "derivative"
     return "taped" if taped else "forward"
@@ -83,9 +78,8 @@ class _Said:
 
 
 def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
-    """Compile all kernels of an object and its parts in parallel, once per object. Kernels of tangents are left out.
-    Kernels of adjoints are compiled only if ``adjoints`` is true. If only one module is missing, Warp compiles the
-    module at its first launch."""
+    """Compile all kernels of an object and its parts in parallel, once per object, except kernels of tangents. If only
+    one module is missing, Warp compiles the module at its first launch."""
     if _ahead.get(id(owner)) is owner:
         return
     _ahead[id(owner)] = owner
@@ -170,7 +164,6 @@ VERBOSE = "CORTADO_VERBOSE"
 
 @contextmanager
 def c_stderr_to(file: int) -> Iterator[None]:
-    """Redirect the stderr of C code to an open file."""
     try:
         stderr = os.dup(2)
     except OSError:  # there is none
@@ -191,8 +184,7 @@ ROOM = 16 * 2**20
 
 @cache
 def start_warp() -> None:
-    """Start Warp once per process. If Warp's cache is unusable, print a warning and compile kernels in a temporary
-    folder. Raises `ComputationError` if no temporary folder can be made."""
+    """If Warp's cache is unusable, kernels are compiled in a temporary folder, with a warning."""
     reason, folder, temporary = init_warp(), wp.config.kernel_cache_dir, None
     reason = reason or _trouble(folder)
     if reason is None:
@@ -230,8 +222,7 @@ def complaint(error: Exception) -> str | None:
 
 
 def init_warp() -> str | None:
-    """Start Warp, and return the reason why it cannot store kernels, or None. Unless the user chose a log level, the
-    messages of the start are hidden, and later only warnings and errors are shown."""
+    """Return the reason why Warp cannot store kernels, or None."""
     chosen = wp.config.log_level
     quiet = os.environ.get(VERBOSE, "0") in ("", "0") and chosen >= wp.LOG_INFO
     try:
@@ -263,7 +254,6 @@ def _kernels(folder: str) -> Iterator[Path]:
 
 
 def _is_whole(kernel: Path) -> bool:
-    """Test on Linux whether a kernel's object files are complete."""
     if sys.platform != "linux":
         return True
     for file in kernel.glob("*.o"):
@@ -313,7 +303,6 @@ def _needed() -> Version | None:
 
 
 def device_named(name: str) -> Any:
-    """Return the Warp device with this name, or raise `InputError`."""
     found = ", ".join(str(device) for device in wp.get_devices())
     none = "" if wp.get_cuda_device_count() else f"; {why_no_gpu()}"
     with suppress(RuntimeError, ValueError):

@@ -51,11 +51,9 @@ class Precision:
         return wp.types.matrix(shape=(3, 3), dtype=self.real)
 
     def vector_of(self, values: Iterable[float]) -> Any:
-        """Return a Warp vector of three components, from two or three numbers. In 2-D, z is 0."""
         return self.vector(*(*values, 0.0)[:3])
 
     def fractions(self, phases: int) -> Any:
-        """Return the Warp vector type with one component for each phase."""
         return wp.types.vector(length=phases, dtype=self.real)
 
 
@@ -64,7 +62,6 @@ FLOAT64 = Precision("float64", wp.float64, wp.vec3d, wp.vec2d, np.float64, 1e-20
 
 
 def precision_named(name: str) -> Precision:
-    """Return the precision called ``"float32"`` or ``"float64"``, or raise `InputError`."""
     for precision in (FLOAT32, FLOAT64):
         if isinstance(name, str) and precision.name == name:
             return precision
@@ -72,7 +69,6 @@ def precision_named(name: str) -> Precision:
 
 
 def struct_of(name: str, precision: Precision, **fields: Any) -> Any:
-    """Return the Warp struct with a name, a precision and fields of the given types."""
     return wp.struct(type(f"{name}_{precision.name}", (), {"__annotations__": fields, "__module__": __name__}))
 
 
@@ -89,8 +85,7 @@ class TypesByName:
     """
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
-        """Set the usual type, and mappings from a type to the names of parameters with this type. Later mappings have
-        priority."""
+        """``names`` map types to the names of parameters. Later mappings have priority."""
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 
@@ -106,7 +101,6 @@ class TypesByName:
         return self(function, lambda kind: wp.array(dtype=kind) if isinstance(kind, type) else kind)
 
     def kernel(self, module: Any, **options: Any) -> Callable[..., Any]:
-        """Return a decorator for kernels in a Warp module, which gives types to the parameters like `arrays`."""
         return lambda function: wp.kernel(self.arrays(function), module=module, **options)
 
     def _of(self, name: str) -> Any:
@@ -117,8 +111,7 @@ class TypesByName:
 
 @cache
 def arithmetic(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Build the Warp functions ``root``, ``inverse_root`` and ``reciprocal`` of positive normal numbers. If ``taped``
-    is true, the functions have derivatives and exact IEEE 754 rounding."""
+    """The arguments are positive normal numbers. ``taped`` functions have derivatives and exact IEEE 754 rounding."""
     return _of_the_gpu() if precision == FLOAT32 and not taped else _plain(precision)
 
 
@@ -160,8 +153,7 @@ def _of_the_gpu() -> SimpleNamespace:
 
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
-"""Number of lanes on a GPU by the number of particles. A pair has the greatest number of particles, and the number of
-lanes."""
+"""Each pair has the greatest number of particles, and the number of lanes on a GPU up to this size."""
 _OF_MODULES: dict[str, int] = {}
 
 
@@ -176,8 +168,7 @@ def lanes_of(kernel: wp.Kernel) -> int:
 
 @cache
 def check_sum(kernel: wp.Kernel) -> None:
-    """Raise `TypeError` for a kernel with a neighbourhood that begins with the wrong particle. The same error is raised
-    for a kernel that sums over lanes but has only one thread per particle."""
+    """Raise `TypeError` for a kernel over neighbours that ignores its range of particles or its lanes."""
     source = kernel.adj.source
     if f"{kernel.adj.args[0].label}.first" not in source:
         raise TypeError(
@@ -206,7 +197,6 @@ COUNTS = (1, 2, 4, 8, 16)
 
 
 def checked_lanes(lanes: Any) -> int | None:
-    """Return the user's number of lanes or None. Raises `InputError` for an invalid number."""
     if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
         wanted = ", ".join(map(str, COUNTS))
         raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")
@@ -214,8 +204,6 @@ def checked_lanes(lanes: Any) -> int | None:
 
 
 def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
-    """Return the number of lanes on a device. A GPU uses ``wanted`` lanes, or by default a number that depends on the
-    number of particles."""
     if device.is_cpu:
         return 1
     return wanted or next((lanes for most, lanes in BY_SIZE if particles <= most), 1)
@@ -223,12 +211,8 @@ def lanes_for(particles: int, device: Any, wanted: int | None = None) -> int:
 
 @cache
 def lane_functions(precision: Precision, lanes: int) -> SimpleNamespace:
-    """Build the Warp functions for kernels with ``lanes`` lanes, which is a power of 2 up to 32.
-
-    ``lane`` returns the index of a thread's lane. ``add_up`` and ``add_up_vectors`` return sums over the lanes.
-    ``vote`` returns an integer whose bit k is set if lane k votes yes. ``ones`` counts the set bits, and ``before``
-    counts the set bits of lower lanes.
-    """
+    """``lanes`` is a power of 2 up to 32. ``vote`` returns an integer whose bit k is set if lane k votes yes. ``ones``
+    counts the set bits, and ``before`` counts the set bits of lower lanes."""
     return _of_one(precision) if lanes == 1 else _of_several(precision, lanes)
 
 

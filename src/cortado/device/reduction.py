@@ -57,8 +57,6 @@ def sum_and_maximum_kernel(precision: Precision, is_cpu: bool) -> ReductionKerne
 
 
 def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
-    """Return a kernel that combines a scene's values into partial values, with one thread for each partial value."""
-
     def reduce(count: int, stride: int, values: wp.array(dtype=dtype), partial: wp.array(dtype=dtype)):
         t = wp.tid() % stride
         first = wp.tid() // stride * count
@@ -71,8 +69,7 @@ def _of_threads(name: str, dtype: Any, combine: Any) -> ReductionKernel:
 
 
 def _of_blocks(name: str, dtype: Any, combine: str) -> ReductionKernel:
-    """Return a kernel that combines a scene's values into partial values, with one block of threads for each partial
-    value. ``combine`` is a C++ expression in a and b."""
+    """``combine`` is a C++ expression in a and b."""
     threads = BLOCK
     while threads * wp.types.type_size_in_bytes(dtype) > SHARED:
         threads //= 2
@@ -146,13 +143,11 @@ class TreeReduction:
 
 
 def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeReduction:
-    """Return a reduction that adds up numbers, vectors or matrices (members * n,)."""
     return TreeReduction(sum_kernel(dtype, device.is_cpu), dtype, particles, device, members)
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
-    """Return a reduction of pairs (members * n,). It computes the sum of the first components and the maximum of the
-    second components."""
+    """The sum is over the first components of pairs, and the maximum is over the second components."""
     level = sum_and_maximum_kernel(precision, device.is_cpu)
     return TreeReduction(level, precision.pair, particles, device, members)
 

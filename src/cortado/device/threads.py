@@ -33,8 +33,7 @@ CORES = "CORTADO_CORES"
 
 
 def usable_cores() -> int:
-    """Return the number of cores that this process may use. The environment variable CORTADO_CORES can reduce the
-    number. Raises `InputError` if the variable is invalid."""
+    """The environment variable CORTADO_CORES limits the number."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get(CORES, "").strip()
     if not limit:
@@ -53,8 +52,7 @@ def helpers() -> ThreadPoolExecutor:
 
 
 def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int) -> None:
-    """Call ``work`` for each item on several cores and wait for all calls. After an error or an interruption the
-    remaining items are skipped."""
+    """After an error or an interruption the remaining items are skipped."""
     waiting = iter(items)
 
     def take() -> None:
@@ -74,8 +72,7 @@ def in_parallel(work: Callable[[Any], object], items: Iterable[Any], cores: int)
 
 
 class WarpLock(ContextDecorator, threading.local):
-    """The lock that a thread holds while it uses Warp. The lock is reentrant, and works as a context manager or a
-    decorator."""
+    """A thread holds this reentrant lock while it uses Warp."""
 
     _lock = threading.RLock()
     _entries = 0
@@ -114,11 +111,8 @@ WARP = WarpLock()
 
 
 class Turn:
-    """The lock that a thread holds while it uses a simulation. While a captured graph is replayed, other threads may
-    use Warp.
-
-    Several calls inside ``with simulation.turn:`` are not interrupted by other threads.
-    """
+    """While a captured graph is replayed, other threads may use Warp. Several calls inside ``with simulation.turn:``
+    are not interrupted by other threads."""
 
     def __init__(self, device: Any):
         self._lock, self._device = threading.RLock(), device
@@ -159,8 +153,6 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def in_turn(method: Method) -> Method:
-    """Decorate a method so that it holds the lock ``turn`` of its object while it runs."""
-
     @wraps(method)
     def held(self: Any, *args: Any, **options: Any) -> Any:
         with self.turn:
@@ -195,7 +187,6 @@ class Payload:
 
     @classmethod
     def of(cls, function: Callable[[Any], Any]) -> "Payload":
-        """Pickle a function, or raise `InputError`."""
         content = pickled(function, "The function")
         return cls(sha256(content).hexdigest(), versions(), content)
 
@@ -217,7 +208,6 @@ class Answer:
     warnings: tuple[tuple[str, type[Warning]], ...] = ()
 
     def result(self) -> Any:
-        """Issue the warnings of the call, and return its result or raise its error."""
         for text, category in self.warnings:
             warn(text, category)
         if self.error is None:
@@ -228,8 +218,7 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """Pickle a value, including code of the main module. Raises `InputError` with a message that begins with
-    ``what``."""
+    """The result contains code of the main module. The message of an `InputError` begins with ``what``."""
     import cloudpickle
 
     try:
@@ -244,8 +233,7 @@ def versions() -> str:
 
 
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
-    """Call the payload's function for an item in a worker process. The answer contains any exception of the
-    function."""
+    """This function runs in a worker process. The answer contains any exception of the payload's function."""
     with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
         if payload.content is None and payload.digest not in _functions:
             return Lacking()
@@ -354,8 +342,7 @@ def sample_parts(samples: int, pixels: int, real: int) -> dict[str, float]:
 
 
 def require(parts: Mapping[str, float], advice: str, device: Any = None) -> None:
-    """Raise `InputError` if the required memory exceeds the free memory of ``device``. ``parts`` is the required memory
-    by purpose [bytes]."""
+    """``parts`` is the required memory by purpose [bytes]."""
     lack = shortage(parts, device)
     if lack:
         raise InputError(f"This needs {lack}; {advice}.")

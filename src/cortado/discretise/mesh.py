@@ -19,8 +19,7 @@ SPREAD = ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249))
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """A binary tree of boxes around triangles. `cortado.discretise.tree_kernels` describes the numbering of
-    the nodes."""
+    """`cortado.discretise.tree_kernels` describes the numbering of the nodes."""
 
     corners: Points
     """Corners of the triangles (k, 3, 3) [m], sorted by the leaves of the tree."""
@@ -54,8 +53,7 @@ class TriangleTree:
         return TriangleTree(corners, self.order, self.starts, boxes)
 
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
-        """Return the nearest points on the triangles (n, 3) [m] and the distances (n,) [m]. If no triangle is within
-        ``reach`` [m], the nearest point is the given point, and the distance is ``reach``."""
+        """Beyond ``reach`` [m], the nearest point is the given point, and the distance is ``reach``."""
         order = np.arange(len(points))
         if np.isinf(reach) and len(points) > 1:  # along a space-filling curve (Morton 1966)
             lower, sides = points.min(axis=0), np.ptp(points, axis=0)
@@ -70,15 +68,13 @@ class TriangleTree:
         return found, away
 
     def windings(self, points: Points) -> NDArray[np.int32]:
-        """Return the winding numbers (n,) of closed triangles around points (n, 3) [m]."""
         found = np.empty(len(points), dtype=np.int32)
         self.ask("find_windings", points, windings=found)
         return found
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
-        """Return the index pairs (m, 2) of triangles that cross each other by more than ``tolerance`` [m]. Contact at a
-        common vertex is not a crossing. ``names`` (k, 3) has the same number wherever triangles have a common vertex.
-        """
+        """Return the index pairs (m, 2) of triangles that cross by more than ``tolerance`` [m]. Triangles with an equal
+        number in ``names`` (k, 3) share a vertex, where contact is no crossing."""
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -138,15 +134,11 @@ THIN = 1e-15
 def outer_surface(
     corners: Points, pairs: Numbers, holds: Callable[[Points], Which], reach: float
 ) -> tuple[Points, Points]:
-    """Return the surface of a union of closed parts, and weights (n,) for surface integrals. The surface consists of
-    triangles (n, 3, 3) [m], which are cut where parts meet. Triangles inside the union have the weight 0, and
-    coincident triangles share one weight.
+    """Return the triangles (n, 3, 3) [m] of a union of closed parts, cut where parts meet, and weights (n,) for surface
+    integrals. Triangles inside the union have the weight 0, and coincident triangles share one weight.
 
-    Args:
-        corners: (k, 3, 3) of all triangles, counterclockwise as seen from outside [m].
-        pairs: (m, 2) indices of all triangles that may meet away from their edges.
-        holds: tests (n,) which points (n, 3) [m] are inside a part.
-        reach: distance from a triangle at which its two sides are tested [m].
+    ``pairs`` (m, 2) are all triangles that may meet away from their edges. ``holds`` tests which points (n, 3) are
+    inside a part. The two sides of each triangle are tested at the distance ``reach`` [m].
     """
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
@@ -199,8 +191,7 @@ def _sides(triangles: Points) -> Points:
 
 
 def _within_triangle(triangle: Points, points: Points) -> tuple[Which, Points]:
-    """Test (n,) which points (n, 2) are inside a triangle (3, 3) in the projection along the last axis. Also return the
-    height of the triangle at the points (n,)."""
+    """Work in the projection along the last axis. Also return the height of the triangle at each point (n,)."""
     a, b, c = triangle
     across = (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
     if across == 0.0:
@@ -245,14 +236,12 @@ LOW_DISCREPANCY = 0.7548776662466927 ** np.array([1.0, 2.0])
 BESIDE = 1e-12
 """Distance from a triangle at which its two sides are tested, relative to the size of the mesh."""
 SEEN = 1e-3
-"""Height above the surface at which a point is tested for being inside another part of the solid [spacings of surface
-points]."""
+"""Height at which a surface point is tested for being inside another part [spacings of surface points]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Solid):
-    """The solid inside closed triangles: all points with a winding number of at least 1. Parts of the mesh may
-    overlap."""
+    """All points with a winding number of at least 1 are inside. Parts of the mesh may overlap."""
 
     vertices: Points
     """Vertices (m, 3) [m]."""
@@ -268,7 +257,6 @@ class Mesh(Solid):
 
     @cached_property
     def corners(self) -> Points:
-        """Return the corners of the triangles (k, 3, 3) [m]."""
         return self.vertices[self.triangles]
 
     @property
@@ -287,14 +275,13 @@ class Mesh(Solid):
         return self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
 
     def distance(self, points: Points) -> Points:
-        """Return the distances of points from the surface. Where parts overlap, the depth is underestimated."""
+        """Where parts overlap, the depth is underestimated."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:
         return self._looked_up(points, reach)[1]
 
     def holds(self, points: Points) -> Which:
-        """Test (n,) which points (n, 3) [m] are inside the solid."""
         return np.any([tree.windings(points) > 0 for tree in self._trees], axis=0)
 
     def nearest(self, points: Points) -> Points:
@@ -317,8 +304,7 @@ class Mesh(Solid):
         return found, best
 
     def own_feet(self, fine: float) -> tuple[Points, Points]:
-        """Return points spread evenly over the surface (Roberts 2018, R2), and the outward unit normals at the
-        points."""
+        """The points are a low-discrepancy sequence (Roberts 2018, R2)."""
         order = np.concatenate([part[tree.order] for part, tree in zip(self._numbers, self._trees, strict=True)])
         areas = self.areas()[order]
         total = areas.sum()
@@ -351,11 +337,10 @@ class Mesh(Solid):
         return enclosed_moments(*outer_surface(self.corners, np.concatenate(pairs), self.holds, reach))
 
     def normals(self) -> Points:
-        """Return the outward unit normals of the triangles (k, 3). The normal of a triangle without area is 0."""
+        """The normal of a triangle without area is 0."""
         return self._across / np.maximum(np.linalg.norm(self._across, axis=1, keepdims=True), 1e-300)
 
     def areas(self) -> Points:
-        """Return the areas of the triangles (k,) [m2]."""
         return 0.5 * np.linalg.norm(self._across, axis=1)
 
     @cached_property

@@ -12,8 +12,7 @@ from cortado.errors import InputError
 SAME = 1e-6
 """Greatest distance between merged vertices, relative to the size of the mesh."""
 COARSE, TOLD = 0.02, 1e-3
-"""Limits of the rounding of coordinates, relative to the size of the mesh. Above the first limit a file is refused.
-Above the second limit a note is given."""
+"""Rounding of coordinates above which a file is refused or noted, relative to the size of the mesh."""
 ASIDE = 1e-6
 """Distance from a surface at which its two sides are tested, relative to the size of the mesh."""
 CROSSED = 1e-7
@@ -22,8 +21,7 @@ LOOKED_AT = 8192
 SAME_WAY = 1e-6
 """Greatest angle between coincident triangles at an edge [rad]."""
 TOGETHER = 1e-3
-"""Angle below which two triangles at an edge count as running in the same direction [rad]. The angle allows for float32
-coordinates."""
+"""Angle within which two triangles at an edge have one direction, despite float32 coordinates [rad]."""
 MEETING = (
     "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
     "says what is inside: delete faces that divide its inside or stick out of it."
@@ -61,12 +59,10 @@ class Edges:
         return np.bincount(self.names.ravel(), minlength=len(self.ends))
 
     def close(self) -> Which:
-        """Test (e,) which edges are closed. At a closed edge, equally many triangles run along the edge in both
-        directions."""
+        """At a closed edge, equally many triangles run along the edge in both directions."""
         return np.asarray(np.bincount(self.names.ravel(), self.ways.ravel(), len(self.ends)) == 0.0)
 
     def check(self, vertices: Points, what: str) -> None:
-        """Raise `InputError` if an edge is not closed. ``what`` is the name of the mesh."""
         unbalanced, counts = ~self.close(), self.counts
         meeting, opened = (unbalanced & (counts > 2), "edge", MEETING), (counts == 1, "open edge", OPEN)
         for wrong, edge, sentence in (meeting, opened, (unbalanced, "edge", TURNED)):
@@ -83,8 +79,7 @@ def place_in_file(place: Points) -> str:
 
 
 def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tuple[Points, Numbers]:
-    """Merge vertices closer than ``tolerance``, and remove duplicate and degenerate triangles. Return vertices (m, 3)
-    and triangles (k, 3)."""
+    """Merge vertices closer than ``tolerance``. Remove duplicate and degenerate triangles."""
     from scipy.spatial import cKDTree
 
     order, names = np.lexsort(vertices.T), np.empty(len(vertices), dtype=np.int64)
@@ -102,19 +97,14 @@ def merged(vertices: Points, triangles: Numbers, tolerance: float = 0.0) -> tupl
 
 
 def _connected(links: Numbers, count: int) -> Numbers:
-    """Return the index of each node's connected component (count,) in a graph with the edges ``links`` (m, 2)."""
     from trimesh.graph import connected_component_labels
 
     return np.asarray(connected_component_labels(links, count), dtype=np.int64)
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """Divide the triangles of a closed mesh into bodies, and return the index of each triangle's body (k,). Triangles
-    at an edge belong to one body if the solid is between them.
-
-    Raises `InputError` at an edge from which the surface continues in more than two directions. ``origin`` (3,) is the
-    position of the mesh in the file.
-    """
+    """Return the index of each triangle's body (k,). Triangles at an edge belong to one body if the solid is between
+    them. ``origin`` (3,) is the position of the mesh in the file."""
     sides = np.argsort(edges.names.ravel(), kind="stable")
     first = np.append(0, np.cumsum(edges.counts))[:-1]
     two = edges.counts == 2
@@ -166,16 +156,11 @@ def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
     """Divide the triangles into parts, so that no two bodies in the same part overlap. No parts are returned if the
-    mesh does not cross itself. Also return a triangle where a body crosses itself, or None. Finally, return a triangle
-    of a body that is inside another body, or None.
+    mesh does not cross itself. Also return a triangle where a body crosses itself, and a triangle of a body inside
+    another body, or None.
 
-    Args:
-        mesh: a closed mesh.
-        tree: the tree of the mesh's triangles.
-        labels: (k,) the body of each triangle.
-        crossings: (m, 2) pairs of triangles that cross.
-        some: (s,) indices of triangles. Each body has at least one triangle with a non-zero area among them.
-        beside: (s, 3) a point just outside each triangle in ``some`` [m].
+    ``labels`` (k,) is the body of each triangle, and ``crossings`` (m, 2) are the triangles that cross. Every body has
+    a triangle with an area in ``some`` (s,). ``beside`` (s, 3) is a point just outside each of these triangles [m].
     """
     count = int(labels.max()) + 1
     bodies = [np.flatnonzero(labels == body) for body in range(count)]
@@ -210,8 +195,7 @@ def parts_of(
 
 
 def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
-    """Return the owner of each body (bodies,). The owner of a cavity is the smallest body around the cavity. Any other
-    body is its own owner."""
+    """The owner of a cavity is the smallest body around the cavity. Any other body is its own owner."""
     owners = np.arange(len(volumes))
     for cavity in np.flatnonzero(volumes < 0.0):
         holds = (around[:, seen == cavity] > 0).all(axis=1) & (volumes > -volumes[cavity])
@@ -234,8 +218,7 @@ def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
 
 
 def _volume(corners: Points) -> float:
-    """Return the volume inside a closed surface of triangles (k, 3, 3) [m3]. The volume is negative if the normals
-    point inwards."""
+    """The volume is negative if the normals point inwards."""
     a, b, c = np.moveaxis(corners - corners[0, 0], 1, 0)
     return float((a * np.cross(b, c)).sum() / 6.0)
 
@@ -251,8 +234,7 @@ class FoundMesh:
 
 
 def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float = 0.0) -> FoundMesh:
-    """Build the solid inside triangles (k, 3) with vertices (m, 3), or raise `InputError`. ``rounding`` is the rounding
-    step of the coordinates, or 0. ``what`` is the name of the mesh."""
+    """``rounding`` is the rounding step of the coordinates, or 0. ``what`` is the name of the mesh."""
     used = vertices[triangles.ravel()]
     if not np.isfinite(used).all():
         wrong = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
@@ -290,8 +272,7 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
 def _solid_parts(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, origin: Points, what: str
 ) -> tuple[tuple[Numbers, ...], tuple[str, ...]]:
-    """Return the parts of a closed mesh, and notes for the user. ``labels`` (k,) is the body of each triangle. Raises
-    `InputError` if the mesh is inside out."""
+    """Also return notes for the user. ``labels`` (k,) is the body of each triangle."""
     size = np.ptp(mesh.corners, axis=(0, 1)).max()
     crossings = tree.crossings(mesh.triangles, CROSSED * size)
     some = np.unique(np.append(np.arange(0, len(labels), -(-len(labels) // LOOKED_AT)), crossings[:LOOKED_AT]))

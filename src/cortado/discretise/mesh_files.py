@@ -38,16 +38,9 @@ def read_mesh(
     support: float | None = None,
     container: tuple[Points, Points] | None = None,
 ) -> Mesh:
-    """Read the solid in a file and check it. Raises `InputError` with the file, the mistake and the remedy. Warns with
-    `CortadoWarning` about probably unintended features.
-
-    Args:
-        path: the file's path.
-        scale: factor for the lengths in the file, such as 0.001 for millimetres.
-        spacing: particle spacing [m].
-        support: support radius [m]. None for a region of fluid, which may have any thickness.
-        container: lower and upper corner, each (3,) [m], of the box around the container. None without a container.
-    """
+    """Read and check the solid in a file. ``scale`` is a factor for the lengths in the file, such as 0.001 for
+    millimetres. ``support`` [m] is None for a region of fluid, which may have any thickness. ``container`` has the
+    lower and the upper corner (3,) [m] of the box around the container."""
     found, what = mesh_in_file(path), repr(path)
     mesh = found.mesh.moved(scale, np.zeros(3))
     length = float(np.ptp(mesh.extent(), axis=0).max())
@@ -76,8 +69,7 @@ def mesh_in_file(path: str) -> FoundMesh:
 
 
 def triangles_in_file(path: str) -> tuple[Points, Numbers]:
-    """Read the vertices (m, 3) and the triangles (k, 3) of a surface, which may be open. Vertices are in the file's
-    unit."""
+    """The surface may be open. Vertices (m, 3) are in the file's unit."""
     vertices, triangles, _ = read_triangles(path)
     if not np.isfinite(vertices).all():
         raise InputError(f"{path!r} has a vertex that is not finite: export the mesh once more.")
@@ -85,8 +77,7 @@ def triangles_in_file(path: str) -> tuple[Points, Numbers]:
 
 
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
-    """Read the vertices (m, 3) and the triangles (k, 3) of all bodies in a file. Vertices are in the file's unit. Also
-    return the rounding step of float32 coordinates, or 0. Raises `InputError` if there are no triangles."""
+    """Also return the rounding step of float32 coordinates, or 0. Vertices (m, 3) are in the file's unit."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
     if not (size := Path(path).stat().st_size):
@@ -151,8 +142,7 @@ class Thickness:
 
     @property
     def thinnest(self) -> float:
-        """Return the thickness of sheets [m], ignoring the thinnest fraction `SHARE` of the surface. Infinite without
-        sheets."""
+        """Return the thickness of sheets [m], or infinity. The thinnest fraction `SHARE` of the surface is ignored."""
         return float(np.quantile(np.where(self.is_sheet, self.lengths, np.inf), SHARE, method="higher"))
 
 
@@ -171,8 +161,6 @@ def thickness_of(mesh: Mesh, reach: float) -> Thickness:
 
 
 def _thickness_notes(mesh: Mesh, origin: Points, what: str, spacing: float, support: float) -> Iterator[str]:
-    """Yield notes on a mesh with thin walls. ``support`` is the support radius [m]. Raises `InputError` if the walls
-    would leak."""
     found, least = thickness_of(mesh, support), LEAST_THICKNESS * spacing
     found = replace(found, points=origin + found.points)
     sheet, sharp = (found.lengths < least) & found.is_sheet, (found.lengths < least) & ~found.is_sheet

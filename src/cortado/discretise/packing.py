@@ -25,8 +25,7 @@ NO_LIMIT = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class PointsAround:
-    """A neighbour search for particles by cells. The points are the particles, followed by fixed points of air and
-    walls."""
+    """The points are the particles, followed by fixed points of air and walls."""
 
     lattice: RestLattice
     points: Points
@@ -41,17 +40,14 @@ class PointsAround:
     """Search radius [m]."""
 
     def near(self, particles: Points) -> Which:
-        """Test (n,) which particles (n, d) [m] have a point within the search radius."""
         return self._looked(particles, np.zeros(len(particles), dtype=bool), most=1)["counts"] > 0
 
     def sums(self, particles: Points, blind: Which) -> Points:
-        """Return the sums of weighted kernels (n,) [1 / m^d] at particles (n, d) [m]. Particles in ``blind`` (n,)
-        ignore air."""
+        """Return the sums of weighted kernels (n,) [1 / m^d]. Particles in ``blind`` (n,) ignore air."""
         return np.asarray(self._looked(particles, blind)["sums"])
 
     def lists(self, particles: Points, blind: Which) -> tuple[Int32s, Int32s, Int32s]:
-        """Return the neighbour lists of particles (n, d) [m]: the start (n,) and end (n,) of each list, and the indices
-        of neighbours. A list has only neighbours with a higher index than the particle."""
+        """Return starts (n,), ends (n,) and neighbours. Only neighbours with a higher index are listed."""
         room = len(lattice_offsets(self.lattice.spacing, self.reach, self.lattice.dimension))
         while True:
             starts = (room * np.arange(len(particles) + 1)).astype(np.int32)
@@ -74,7 +70,6 @@ class PointsAround:
 
     @property
     def volume(self) -> float:
-        """Return the volume of a particle in the lattice at rest density [m^d]."""
         return rest_volume(self.lattice.kernel, self.lattice.spacing, self.lattice.support, self.lattice.dimension)
 
     @cached_property
@@ -132,15 +127,13 @@ DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return the relative density excess (n,), given the sums of kernels (n,) [1 / m^d]. Where ``stays`` (n,) is true,
-    the excess is at least 0."""
+    """Return the relative density excess (n,), which is at least 0 where ``stays`` (n,) is true."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 
 
 class Relaxation:
-    """The least-squares problem for the positions of n particles. Particles in ``free`` (n,) move, and particles in
-    ``stays`` (n,) ignore air."""
+    """Particles in ``free`` (n,) move, and particles in ``stays`` (n,) ignore air."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
@@ -183,8 +176,7 @@ class Relaxation:
         return np.asarray(found.reshape(-1, 3))
 
     def linearise(self, close: float) -> None:
-        """Compute the sums of kernels (n,) [1 / m^d], and the distances (m,) [m] of pairs closer than ``close`` [m].
-        Also compute the derivatives of the sums and the distances."""
+        """Compute `sums` (n,) [1 / m^d], `distances` (m,) of pairs closer than ``close`` [m], and their derivatives."""
         kernels, count, most = self._around.kernels, len(self._free), self._most
         at_its_place = self._around.lattice.weights(np.zeros((1, self._around.lattice.dimension)))[0]
         self.sums, distances = np.full(count, at_its_place), np.empty(most)
@@ -199,8 +191,7 @@ class Relaxation:
         self.distances = distances[: close_starts[-1]]
 
     def multiply(self, moves: Points) -> tuple[Points, Points]:
-        """Return the changes of the sums of kernels (n,) [1 / m^d] and of the pair distances (m,) [m] for moves (n, 3)
-        [m]."""
+        """Return the changes of `sums` (n,) and of `distances` (m,) for moves (n, 3) [m]."""
         changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
         self._launch(self._around.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
         return changes, approaches
@@ -239,21 +230,18 @@ class Packing:
     """Lengths of the periodic box (d,) [m], or 0 along axes without a period."""
 
     def packed(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Return rest positions (m, d) [m] of particles (n, d) [m], and the indices (m,) of the remaining particles.
-        Particles in ``stays`` (n,) do not move. The last few results are cached."""
+        """Return rest positions (m, d) and indices of the remaining particles. Particles in ``stays`` do not move."""
         arrays = self.fixed, self.weights, self.lengths, particles, stays
         found, kept = _packed(self.lattice, particles.shape, self.air, *(array.tobytes() for array in arrays))
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
-        """Return the relative density excess over the lattice (m,) for ``some`` of the particles (n, d) [m]. Particles
-        in ``stays`` (n,) ignore air and have an excess of at least 0."""
+        """Particles in ``stays`` (n,) ignore air and have an excess of at least 0."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Pack particles like `packed`, without the cache. Particles that remain too compressed, and more so than their
-        neighbours, are removed."""
+        """Particles that remain too compressed, and more so than their neighbours, are removed."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             errors = np.round(self.errors(found, np.ones(len(found), dtype=bool)), DIGITS)

@@ -23,8 +23,6 @@ cell_of, wrap, below, above = _cells.cell_of, _cells.wrap, _cells.below, _cells.
 
 @wp.struct
 class Around:
-    """The points around particles, with their weights in the density."""
-
     x: wp.array(dtype=vector)
     """Positions [m]."""
     weights: wp.array(dtype=real)
@@ -81,7 +79,6 @@ def separation(x_i: vector, x_j: vector, around: Around) -> vector:
 
 @cache
 def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
-    """Build the kernels of a packing and the structs ``around``, ``placed``, ``grid`` and ``equations``."""
     functions = smoothing_functions(smoothing, FLOAT64)
     weight, slope = functions.weight, functions.slope
     module = kernel_module(f"packing_{smoothing.name}")
@@ -94,11 +91,8 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     def look_around(
         first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
-        """List the points within ``reach`` of each particle, and sum their weighted smoothing kernels.
-
-        At most ``most`` points are listed for each particle. Particles in ``blind`` ignore air. If ``are_own`` is true,
-        particle i is also point i, and points with an index up to i are skipped.
-        """
+        """At most ``most`` points are listed for each particle. Particles in ``blind`` ignore air. If ``are_own`` is
+        true, particle i is also point i, and points with an index up to i are skipped."""
         i = first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -125,8 +119,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     @typed.arrays
     def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
-        """Add the smoothing kernel of each listed pair to the ``sums`` of both particles. Pairs with a free particle
-        are appended to ``equations``. Distances of pairs closer than ``close`` [m] are appended to ``distances``."""
+        """Pairs with a free particle are added to ``equations``, and to ``distances`` if closer than ``close`` [m]."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)

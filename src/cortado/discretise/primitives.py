@@ -1,4 +1,4 @@
-"""Solids of simple shapes, and lattice points within solids, in float64."""
+"""Solids of simple shapes, and lattice points within solids, in float64. Lengths are in [m]."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,7 @@ from cortado.discretise.shapes import corners as corners_of
 from cortado.discretise.solid import Faces, Moments, Solid, enclosed_moments, nearest_on_edges
 
 FACING = 0.9
-"""Least cosine between the directions of two opposite sides of a polygon that form a sheet, with one direction
-reversed."""
+"""Two sides form a sheet if the cosine between their inward normals is below the negative of this value."""
 NODES = 0.5 + np.sqrt(0.15) * np.array([-1.0, 0.0, 1.0])
 """Nodes of three-point Gauss quadrature on the interval from 0 to 1."""
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
@@ -54,7 +53,6 @@ class Round(Solid):
     half: Points
     """Vector from the middle to the end of the segment (d,) [m]."""
     radius: float
-    """Radius [m]."""
 
     def extent(self) -> tuple[Points, Points]:
         reach = np.abs(self.half) + self.radius
@@ -97,8 +95,6 @@ class Round(Solid):
 
 @dataclass(frozen=True)
 class Revolved(Solid):
-    """A solid of revolution about a coordinate axis."""
-
     profile: Solid
     """Plane cross-section through the axis, with straight edges. The first coordinate is the distance from the axis."""
     axis: int
@@ -127,8 +123,7 @@ class Revolved(Solid):
         x, y = np.moveaxis(start[:, None] + NODES[:, None] * (end - start)[:, None], 2, 0)
 
         def integral(p: int, q: int) -> float:
-            """Return the integral of x^p (y - height)^q over the profile, by Green's theorem. Here x is the distance
-            from the axis, and y is the position along the axis."""
+            """Return the integral of x^p (y - height)^q over the profile, by Green's theorem."""
             return float((end - start)[:, 1] @ (x ** (p + 1) * (y - height) ** q @ WEIGHTS) / (p + 1))
 
         volume, along = 2.0 * np.pi * integral(1, 0), np.eye(3)[self.axis]
@@ -138,23 +133,20 @@ class Revolved(Solid):
         return Moments(volume, (height + middle) * along, second)
 
     def _flat(self, points: Points) -> Points:
-        """Return the distances from the axis and the heights of points (n, 2) [m]."""
         across = np.linalg.norm(np.delete(points, self.axis, axis=1), axis=1)
         return np.column_stack([across, points[:, self.axis]])
 
 
 @dataclass(frozen=True)
 class HalfSpace(Solid):
-    """All points below a plane. Pictures show only the points inside a box."""
+    """All points below a plane. Pictures show only the points between ``lower`` and ``upper``."""
 
     normal: Points
     """Upward unit vector (d,)."""
     height: float
     """Height of the plane along the normal [m]."""
     lower: Points
-    """Lower corner of the box (d,) [m]."""
     upper: Points
-    """Upper corner of the box (d,) [m]."""
 
     @property
     def is_bounded(self) -> bool:
@@ -232,7 +224,6 @@ class Polygon(Solid):
 
 
 def box_faces(half: Points) -> Faces:
-    """Return the faces of a box centred at the origin, with half lengths (d,) [m]."""
     if len(half) == 2:
         return polygon_faces(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
@@ -241,8 +232,7 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """Return the faces of the part of a box below a plane. The plane has the unit vector ``normal`` (d,) and lies at
-    ``height`` [m] along this vector."""
+    """The part of the box below the plane remains. ``height`` [m] is along the unit vector ``normal`` (d,)."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -276,8 +266,7 @@ def arc(centre: Points, radius: float, start: float, end: float, fine: float) ->
 
 
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
-    """Return the faces of a solid of revolution, about ``fine`` [m] wide. The profile is the cross-section through the
-    axis of revolution, and is symmetric about the axis."""
+    """The profile is symmetric about the axis. Faces are about ``fine`` [m] wide."""
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -305,7 +294,7 @@ def outer_edges(profile: Faces) -> Points:
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """Return the start (2,) of an edge. If the edge crosses the axis, return the intersection."""
+    """If the edge crosses the axis, return the intersection."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
@@ -319,7 +308,6 @@ def _standing(direction: Points) -> Points:
 
 
 def block_around(solid: Solid, spacing: float) -> Block:
-    """Return a lattice of points that covers the box around a solid."""
     lower, upper = solid.extent()
     return block_between(lower, upper + 0.5 * spacing, spacing)
 

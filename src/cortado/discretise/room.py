@@ -18,19 +18,15 @@ TOLERANCE = 0.5
 
 @dataclass(frozen=True)
 class Region:
-    """A convex region in d dimensions, by default all of space."""
+    """A box with corners ``lower`` and ``upper`` (d,) [m], or its part inside a cylinder or sphere."""
 
     lower: Points
-    """Lower corner (d,) [m]."""
     upper: Points
-    """Upper corner (d,) [m]."""
     base: Points
     """Point on the axis of the cylinder, or centre of the sphere (d,) [m]."""
     across: Points
-    """Factor of each axis (d,) in the radius of a cylinder or sphere. The factor is 0 along the axis of a cylinder, and
-    1 along all other axes."""
+    """Factor of each axis (d,) in the radius: 0 along the axis of a cylinder, and otherwise 1."""
     radius: float = np.inf
-    """Radius of the cylinder or sphere [m]."""
     rim: float = np.inf
     """Height of an open cylinder's rim along its axis [m], or infinity for a cylinder with a lid."""
 
@@ -49,23 +45,21 @@ class Region:
 
     @classmethod
     def cylinder(cls, base: Points, radius: float, height: float, axis: int) -> "Region":
-        """Return a cylinder along a coordinate axis, with the centre of its base at ``base`` (d,) [m]."""
+        """``base`` (d,) [m] is the centre of the base."""
         across = np.where(np.arange(len(base)) == axis, 0.0, 1.0)
         lower, upper = base - radius * across, base + radius * across
         upper[axis] += height
         return cls(lower, upper, base, across, radius)
 
     def distance(self, points: Points) -> Points:
-        """Return the distances of points from the boundary. Beyond an edge or a corner, the distance is
-        underestimated."""
+        """Beyond an edge or a corner, the distance is underestimated."""
         from_faces = np.full(len(points), -np.inf)
         for x, lower, upper in zip(points.T, self.lower, self.upper, strict=True):  # NumPy is slow with short rows
             from_faces = np.maximum(from_faces, np.maximum(lower - x, x - upper))
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Yield a function for each finite side of the region. The function returns the distances of points from the
-        side, which are positive inside."""
+        """Yield a function for each finite side, which returns distances of points. Distances are positive inside."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
                 if np.isfinite(at):
@@ -81,7 +75,6 @@ class Region:
         return np.asarray(boxed - inwards * across)
 
     def contains(self, points: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which points (n, d) [m] are inside, or at most ``tolerance`` [m] outside."""
         return np.asarray(self.distance(points) <= tolerance)
 
     def cell_shares(self, points: Points, spacing: float) -> Points:
@@ -100,8 +93,7 @@ class Region:
         return np.sqrt(squares)
 
     def escaped(self, before: Points, after: Points, tolerance: float) -> np.ndarray:
-        """Test (n,) which particles crossed a wall between the positions ``before`` and ``after`` (n, d) [m]. Particles
-        may cross the rim."""
+        """Test (n,) which particles crossed a wall. Particles may cross the rim."""
         through = self.contains(before, tolerance) & ~self.contains(after, tolerance)
         return np.asarray(through & self.is_below_rim(before) & self.is_below_rim(after))
 
@@ -111,7 +103,7 @@ class Region:
         return np.asarray(points @ (1.0 - self.across) < self.rim)
 
     def opened(self, periods: Points) -> "Region":
-        """Return the region without sides along periodic axes. ``periods`` (d,) [m] is 0 along non-periodic axes."""
+        """``periods`` (d,) [m] is 0 along non-periodic axes."""
         lower, upper = np.where(periods > 0.0, -np.inf, self.lower), np.where(periods > 0.0, np.inf, self.upper)
         return Region(lower, upper, self.base, self.across, self.radius, self.rim)
 
@@ -139,8 +131,7 @@ class Domain:
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
     def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Return the lower corner [m], the lengths [m] and the inverse lengths [1/m] of the periodic box as Warp
-        vectors."""
+        """Return the lower corner, the lengths and the inverse lengths as Warp vectors."""
         rest = (0.0,) * (3 - len(self.lengths))
         frequency = (1.0 / length if length else 0.0 for length in self.lengths)
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)
@@ -154,8 +145,7 @@ class Domain:
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
-        """Return the images of points (n, d) [m] in a region between corners (d,) [m], and a mask (n,) of the points
-        with an image there. An infinite corner means the end of the periodic box."""
+        """Also return which points have an image there. An infinite corner is the end of the periodic box."""
         start, lower, upper = self.ends(lower, upper)
         lengths = np.array(self.lengths)
         images = start + wrapped(points - start, lengths) if lengths.any() else points
@@ -171,12 +161,8 @@ class Domain:
         return start, np.where(lengths > 0.0, start, lower), np.where(lengths > 0.0, end, upper)
 
     def ways(self, points: Points, place: Points, reach: float, seen: Callable[[Points], Points]) -> list[Points]:
-        """Return the vectors from ``place`` (d,) to the images of points (n, d) [m], after applying ``seen``. The list
-        has one array (n, k) for each image within ``reach`` [m].
-
-        ``seen`` is a linear function of vectors (n, d), such as their component across a direction. Images that
-        ``seen`` maps to the same vector count once.
-        """
+        """Return the vectors from ``place`` (d,) to the images of points, as one array (n, k) for each image within
+        ``reach`` [m]. The linear function ``seen`` is applied to the vectors. Images with equal results count once."""
         steps, inverse, shifts = self.images(reach, seen)
         way = seen(self.wrapped(points) - place)
         if len(steps):
@@ -184,9 +170,8 @@ class Domain:
         return [way + shift for shift in shifts] if len(steps) else [way]
 
     def images(self, reach: float, seen: Callable[[Points], Points]) -> tuple[Points, Points, Points]:
-        """Return the translations between distinct images (m, k) [m], and the inverse matrix of the translations (k,
-        m). Also return the shifts to all images within ``reach`` (i, k) [m]. Images are distinct if ``seen`` maps them
-        to different points."""
+        """Return the translations between distinct images (m, k), their inverse matrix (k, m), and the shifts to all
+        images within ``reach`` (i, k) [m]. Images are distinct if ``seen`` maps them to different points."""
         lengths, found = np.array(self.lengths), []
         axes = seen(np.eye(len(lengths))) if lengths.any() else np.zeros((0, 0))
         left = np.where(lengths[: len(axes), None] > 0.0, axes, 0.0)
@@ -224,8 +209,7 @@ class Room:
         return len(self.periods)
 
     def from_solids(self, points: Points, reach: float = np.inf) -> Points:
-        """Return the distances of points from the nearest solid, or infinity without solids. Distances above ``reach``
-        [m] are only lower bounds."""
+        """Return infinity without solids. Distances above ``reach`` [m] are only lower bounds."""
         if not self.solids:
             return np.full(len(points), np.inf)
         images = [points + shift for shift in self.shifts()]

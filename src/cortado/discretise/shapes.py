@@ -41,8 +41,7 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """Find the boundary of a condition by bisection. The condition is true at ``low`` (n,) and false at ``high`` (n,).
-    Return the two bounds (n,)."""
+    """The condition is true at ``low`` (n,) and false at ``high`` (n,). Return the two bounds (n,)."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -52,14 +51,12 @@ def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvin
 
 @dataclass(frozen=True)
 class Block:
-    """A lattice of points that fills a box."""
+    """A lattice of points along the axes, with lengths (d,) in [m]."""
 
     first: Points
-    """First point (d,) [m]."""
     counts: Points
     """Numbers of points along the axes (d,), as floats, because they may be larger than any array."""
     spacings: Points
-    """Spacings along the axes (d,) [m]."""
 
     @cached_property
     def size(self) -> float:
@@ -86,12 +83,9 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
-    """Return a lattice of points that fills a box between corners (d,) [m].
-
-    If a side is not an integer number of cells, the lattice is stretched or compressed along the axes by at most
-    `MOST_STRETCHED`. The number of points then matches the volume within `EXCESS`. If no lattice fits so well, only the
-    cells inside the box have points.
-    """
+    """A lattice that does not fit is stretched or compressed along the axes by at most `MOST_STRETCHED`. The number of
+    points then matches the volume within `EXCESS`. If no lattice fits so well, only the cells inside the box have
+    points."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
     if (np.abs(cells - np.rint(cells)) <= ROUND_OFF).all() or not plain.counts.all():
@@ -110,8 +104,7 @@ def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 
 def block_about(centre: ArrayLike, half: ArrayLike, spacing: float) -> Block:
-    """Return a lattice that is symmetric about a centre (d,) [m] and fits into a box with half side lengths
-    (d,) [m]."""
+    """The lattice is symmetric about ``centre`` (d,), and ``half`` (d,) are half side lengths [m]."""
     counts = whole_cells(2.0 * np.asarray(half, dtype=np.float64), spacing)
     first = np.asarray(centre, dtype=np.float64) - 0.5 * (counts - 1.0) * spacing
     return Block(first, counts, np.full(len(first), spacing))
@@ -123,15 +116,13 @@ def lattice(counts: Points, spacing: float) -> Points:
 
 
 def disc(radius: float, spacing: float, dimension: int) -> Points:
-    """Return a lattice in a disc or on a line segment about the origin (n, dimension) [m]. The lattice has at least one
-    point."""
+    """With ``dimension`` 1 the disc is a line segment. There is at least one point."""
     points = lattice(np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0)), spacing)
     return points[np.linalg.norm(points, axis=1) <= radius]
 
 
 def across(direction: ArrayLike) -> Points:
-    """Return perpendicular unit vectors (d - 1, d) that are also perpendicular to the unit vector
-    ``direction`` (d,)."""
+    """Return perpendicular unit vectors (d - 1, d), which are also perpendicular to a unit vector (d,)."""
     frame = [np.asarray(direction, dtype=np.float64)]
     for axis in np.argsort(np.abs(frame[0]), kind="stable")[:-1]:
         vector = np.eye(len(frame[0]))[axis]
@@ -141,15 +132,13 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """Return an origin (d,) [m] near the points (n, d) [m], or 0 if the points are not far from 0. The origin is a
-    multiple of a power of two, so that subtracting it causes no rounding."""
+    """Return an origin near distant points, or 0. The origin is subtracted exactly, as a multiple of a power of two."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
 
 
 def whole_cells(lengths: Points, spacing: float) -> Points:
-    """Return the numbers of cells that fit into lengths [m]."""
     return np.maximum(np.floor(lengths / spacing + ROUND_OFF), 0.0)
 
 
@@ -173,15 +162,8 @@ Pairs = tuple[Numbers, Numbers, Points]
 
 
 def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 0.0, lengths: ArrayLike = 0.0) -> Pairs:
-    """Find all pairs of points that are at most ``reach`` [m] apart, one from ``some`` and one from ``others``.
-
-    Args:
-        some: points (n, d) [m].
-        others: points (m, d) [m].
-        reach: search radius [m].
-        lower: lower corner of the periodic box (d,) [m].
-        lengths: lengths of the periodic box (d,) [m], 0 along axes without a period.
-    """
+    """Return all pairs of a point in ``some`` (n, d) and a point in ``others`` (m, d) at most ``reach`` [m] apart.
+    ``lower`` and ``lengths`` (d,) [m] belong to the periodic box. A length is 0 along an axis without a period."""
     from scipy.spatial import cKDTree
 
     lengths = np.broadcast_to(np.asarray(lengths, dtype=np.float64), some.shape[1:])
@@ -201,8 +183,7 @@ def pairs_within(some: Points, others: Points, reach: float, lower: ArrayLike = 
 
 
 def apart(separations: Points, lengths: ArrayLike) -> Points:
-    """Return separations (m, d) [m] to the nearest periodic image. ``lengths`` (d,) [m] are the lengths of the periodic
-    box."""
+    """Return separations (m, d) [m] to the nearest periodic image, in a box with ``lengths`` (d,) [m]."""
     lengths = np.asarray(lengths, dtype=np.float64)
     if not lengths.any():
         return separations
@@ -219,8 +200,7 @@ def wrapped(positions: Points, lengths: Points) -> Points:
 
 
 MOST_AVERAGE_COMPRESSION = 0.1
-"""Greatest mean compression of the initial particles. The compression is the relative number density minus 1, but at
-least 0."""
+"""Greatest mean of the initial compression, which is the excess of the relative number density over 1."""
 MOST_DENSITY = 1.5
 """Largest relative number density of an initial particle."""
 NOTED_COMPRESSION = 0.03
@@ -241,18 +221,8 @@ def check_crowding(
     bodies: Sequence[str] | NDArray[np.str_] = (),
 ) -> str | None:
     """Return a warning if particles are crowded or too far apart, or None. Raises `InputError` if the particles would
-    burst apart. If two bodies of fluid overlap, the message names both.
-
-    Args:
-        what: name of the particles for messages, in the plural.
-        positions: (n, d) [m].
-        kernel: smoothing kernel.
-        support: support radius [m].
-        volume: volume of a particle at rest [m^d].
-        spacing: particle spacing [m].
-        period: lower corner (d,) and lengths (d,) of the periodic box [m], 0 along axes without a period.
-        bodies: (n,) the name of each particle's body of fluid.
-    """
+    burst apart. ``what`` names the particles in the plural, and ``bodies`` (n,) names each particle's body of fluid.
+    ``volume`` is the volume of a particle at rest [m^d]."""
     point, other, distances = pairs_within(positions, positions, support, *period)
     seen = volume * kernel.weight(distances, positions.shape[1], support)
     densities = np.bincount(point, seen)  # relative to the lattice
@@ -282,8 +252,7 @@ def _compression(densities: NDArray[Any]) -> float:
 def _check_meeting(
     bodies: NDArray[np.str_], positions: Points, point: Numbers, other: Numbers, seen: NDArray[Any]
 ) -> None:
-    """Raise `InputError` if two bodies of fluid overlap. ``seen`` (k,) is the density contribution of each pair of
-    particles."""
+    """``seen`` (k,) is the density contribution of each pair of particles."""
     foreign = bodies[point] != bodies[other]
     together, added = np.bincount(point, seen), np.bincount(point, seen * foreign)
     alone = together - added
@@ -301,7 +270,6 @@ def _check_meeting(
 
 
 def check_apart(what: str, positions: Points, spacing: float, period: Period) -> None:
-    """Raise `InputError` if two particles (n, d) [m] coincide. The error message begins with ``what``."""
     first, second, _ = pairs_within(positions, positions, AT_ONE_PLACE * spacing, *period)
     pairs = np.flatnonzero(first < second)
     if pairs.size:
@@ -329,8 +297,7 @@ def _in_bands() -> Any:
 
 
 def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments: Any) -> None:
-    """Launch a kernel that writes to NumPy arrays. If ``in_bands`` is true, all cores are used, and no two threads may
-    write to the same element."""
+    """Arguments may be NumPy arrays. With ``in_bands``, no two threads may write to the same element."""
     from cortado.device.launching import launch
     from cortado.device.threads import WARP
 
@@ -344,8 +311,7 @@ def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments:
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:
-    """Return a Warp array that shares the memory of a NumPy array. The last of several axes becomes the components of
-    vectors."""
+    """The array shares the memory of ``values``. The last of several axes becomes the components of vectors."""
     import warp as wp
 
     types = {"float64": (wp.float64, wp.vec3d), "int32": (wp.int32, wp.vec3i), "bool": (wp.bool, None)}

@@ -33,12 +33,10 @@ class Sheet(Solid):
 
     @property
     def pieces(self) -> Points:
-        """Return the corners of the edges or triangles (k, d, d) [m]."""
         return self.vertices[self.corners]
 
     @property
     def normals(self) -> Points:
-        """Return the unit normals of the edges or triangles (k, d)."""
         return np.asarray(self._across / np.linalg.norm(self._across, axis=1, keepdims=True))
 
     def centroid(self) -> Points:
@@ -52,7 +50,6 @@ class Sheet(Solid):
         return cls(np.concatenate([one.vertices for one in sheets]), np.concatenate(corners))
 
     def placed(self, position: Points, turn: Points) -> "Sheet":
-        """Return the sheet rotated by the matrix ``turn`` (d, d) and then shifted by ``position`` (d,) [m]."""
         return Sheet(self.vertices @ turn.T + position, self.corners)
 
     def extent(self) -> tuple[Points, Points]:
@@ -65,8 +62,7 @@ class Sheet(Solid):
         return self._tree.nearest(points)[0] if points.shape[1] == 3 else nearest_on_edges(points, self.pieces)
 
     def aside(self, points: Points, distance: float) -> Points:
-        """Move points (n, d) [m] to a distance [m] from the sheet, without changing their side of the sheet. Points on
-        the sheet move along its normals."""
+        """Move points to a distance [m] from the sheet, on the same side, or along the sheet's normals."""
         feet = self.nearest(points)
         away = points - feet
         length = np.linalg.norm(away, axis=1)
@@ -81,7 +77,6 @@ class Sheet(Solid):
         return Faces(self.vertices, np.concatenate([self.corners, self.corners[:, ::-1]]))
 
     def crossed(self, starts: Points, ends: Points, spacing: float) -> Which:
-        """Test (n,) which line segments from ``starts`` (n, d) to ``ends`` (n, d) [m] cross the sheet."""
         from cortado.device.modules import start_warp
 
         start_warp()
@@ -99,8 +94,7 @@ class Sheet(Solid):
 
     @cached_property
     def _across(self) -> Points:
-        """Return the normals of the edges or triangles (k, d). The length of a normal is proportional to the size of
-        the edge or triangle."""
+        """The length of a normal (k, d) is proportional to the size of the edge or triangle."""
         first, *others = np.moveaxis(self.pieces, 1, 0)
         along = [other - first for other in others]
         return along[0][:, ::-1] * np.array([-1.0, 1.0]) if len(along) == 1 else np.cross(*along)
@@ -112,8 +106,6 @@ class Sheet(Solid):
 
 @dataclass(frozen=True, eq=False)
 class Thickened(Solid):
-    """A solid of all points within a distance of a sheet."""
-
     sheet: Sheet
     depth: float
     """Greatest distance from the sheet [m]."""
@@ -155,8 +147,7 @@ class Thickened(Solid):
 
 
 def sheet_points(sheet: Sheet, lattice: RestLattice) -> WallPoints:
-    """Build the wall particles of a sheet, on both sides and around its ends. The particles have the depths of a flat
-    wall's layers."""
+    """The wall particles are on both sides and around the ends, at the depths of a flat wall's layers."""
     apart, layers = DENSITY * lattice.spacing, lattice.layers
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
     positions = np.concatenate([one.points for one in parts])
@@ -168,12 +159,8 @@ def sheet_points(sheet: Sheet, lattice: RestLattice) -> WallPoints:
 def sheet_weights(
     sheet: Sheet, points: Sequence[Points], flat: Sequence[Points], room: Room, lattice: RestLattice, least: float
 ) -> Points:
-    """Compute the weights of a sheet's wall particles (b,). The weights are fitted at points that are at least
-    ``least`` [m] from any surface.
-
-    ``points`` and ``flat`` list the positions (b, d) [m] and the flat-wall weights (b,) of wall particles. The first
-    array of a list belongs to the sheet, and the remaining arrays belong to further walls in the room.
-    """
+    """Return the weights (b,) of a sheet's wall particles, fitted at points at least ``least`` [m] from any surface.
+    The lists ``points`` (b, d) [m] and ``flat`` (b,) begin with the sheet, followed by other walls in the room."""
     spacing, own = lattice.spacing, len(points[0])
     heights = spacing * (np.arange(int(np.ceil(lattice.support / spacing - 0.5))) + 0.5)
     found = np.concatenate([surface_points(Thickened(sheet, height), spacing, 0.0).points for height in heights])

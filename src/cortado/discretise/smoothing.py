@@ -32,19 +32,17 @@ class SmoothingKernel:
     normalisations: tuple[float, float]
     """Dimensionless normalisations of the kernel in 2-D and in 3-D."""
     value: Callable[[np.ndarray], np.ndarray]
-    """The function w(q), where q is the distance divided by the support radius."""
+    """The function w(q)."""
     gradient_factor: Callable[[np.ndarray], np.ndarray]
-    """The function w'(q) / q, where q is the distance divided by the support radius."""
+    """The function w'(q) / q."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return smoothing_kernel, (self.name,)
 
     def normalisation(self, dimension: int, support: float) -> float:
-        """Return the normalisation of the kernel [1 / m^d]."""
         return self.normalisations[dimension - 2] / support**dimension
 
     def weight(self, distance: np.ndarray, dimension: int, support: float) -> np.ndarray:
-        """Return the kernel [1 / m^d] at distances [m]."""
         q = np.minimum(np.asarray(distance, dtype=np.float64) / support, 1.0)
         return self.normalisation(dimension, support) * self.value(q)
 
@@ -73,7 +71,6 @@ KERNELS = {kernel.name: kernel for kernel in (CUBIC_SPLINE, WENDLAND_C2, WENDLAN
 
 
 def smoothing_kernel(name: str) -> SmoothingKernel:
-    """Return the smoothing kernel with this name, or raise `InputError`."""
     if name not in KERNELS:
         raise InputError(f"kernel is {name!r}, but must be one of {', '.join(KERNELS)}.")
     return KERNELS[name]
@@ -89,8 +86,7 @@ RATE_LIMIT = 1.5
 
 
 def lattice_offsets(spacing: float, support: float, dimension: int) -> np.ndarray:
-    """Return the separations (m, d) [m] of a lattice point from all lattice points within the support radius. The point
-    itself is included."""
+    """Return separations (m, d) [m] within the support radius of a lattice point, including the point itself."""
     reach = range(-int(support / spacing) - 1, int(support / spacing) + 2)
     offsets = spacing * np.array(list(itertools.product(reach, repeat=dimension)), dtype=np.float64)
     return offsets[np.linalg.norm(offsets, axis=1) < support]
@@ -102,8 +98,7 @@ def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the particle volume at which the rest lattice is less dense than the rest density by the fraction `SLACK`
-    [m^d]."""
+    """Return the particle volume [m^d] that makes the rest lattice less dense than at rest by `SLACK`."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
@@ -111,16 +106,14 @@ def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimensi
 def _filled(
     kernel: SmoothingKernel, spacing: float, support: float, dimension: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the `lattice_offsets` (m, d) [m], and the gradients of the smoothing kernel there (m, d) [1 / m^(d + 1)].
-    Also return the particle volume at which the lattice has the rest density [m^d]."""
+    """Return `lattice_offsets`, the kernel's gradients there (m, d), and the particle volume at rest density [m^d]."""
     offsets = lattice_offsets(spacing, support, dimension)
     volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
     return offsets, kernel.gradient(offsets, support), volume
 
 
 def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return PCISPH's stiffness times the squared time step [m2] (Solenthaler and Pajarola 2009). The stiffness is
-    reduced if `greatest_rate` exceeds `RATE_LIMIT`."""
+    """Return PCISPH's stiffness times the squared time step [m2] (Solenthaler and Pajarola 2009)."""
     gradients = kernel.gradient(lattice_offsets(spacing, support, dimension), support)
     total = gradients.sum(axis=0)
     volume = rest_volume(kernel, spacing, support, dimension)
@@ -130,8 +123,7 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
 @cache
 def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the overcorrection factor of a pressure iteration for the worst pressure wave on the lattice [-]. The
-    iteration converges if the factor is below 2."""
+    """Return the overcorrection of a pressure iteration for the worst wave. Iterations converge below 2."""
     offsets = lattice_offsets(spacing, support, dimension)
     gradients = kernel.gradient(offsets, support)
     answers = np.sin(_waves(spacing, dimension) @ offsets.T) @ gradients
@@ -139,22 +131,19 @@ def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 
 def shear_factor(kernel: SmoothingKernel, separations: np.ndarray, support: float) -> np.ndarray:
-    """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)], with the separation x (m, d) [m], the smoothing
-    kernel's gradient G, and the support radius h [m]. The Laplacian of a field uses this factor."""
+    """Return F = x . G / (|x|^2 + 0.01 h^2) (m,) [1 / m^(d + 2)] at separations x, with the kernel's gradient G."""
     squares = (separations**2).sum(axis=1)
     return (separations * kernel.gradient(separations, support)).sum(axis=1) / (squares + 0.01 * support**2)
 
 
 def wall_response(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the sum of the smoothing kernel's squared gradient over the lattice [1 / m^(2 d + 2)]. The sum scales the
-    relaxation of the pressure beside walls."""
+    """Return the sum of the kernel's squared gradient over the lattice [1 / m^(2 d + 2)]."""
     return float((kernel.gradient(lattice_offsets(spacing, support, dimension), support) ** 2).sum())
 
 
 @cache
 def lattice_laplacian_correction(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the factor that makes the Laplacian of a parabola exact on the lattice [-]. The Laplacian uses
-    `shear_factor`."""
+    """Return the factor [-] that makes the Laplacian with `shear_factor` exact for a parabola on the lattice."""
     offsets, _, volume = _filled(kernel, spacing, support, dimension)
     return float(-1.0 / (volume * (shear_factor(kernel, offsets, support) * offsets[:, 0] ** 2).sum()))
 
@@ -189,15 +178,13 @@ def pairwise_rate(kernel: SmoothingKernel, spacing: float, support: float, dimen
 
 @cache
 def stress_control(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the damping coefficient ``control`` of the viscous stress in `cortado.sph.stress_kernels` on the lattice
-    [-]."""
+    """Return the damping coefficient of the viscous stress on the lattice [-] (`cortado.sph.stress_kernels`)."""
     return 4.0 / (3.0 * circulation_factor(kernel, spacing, support, dimension))
 
 
 @cache
 def stress_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the greatest eigenvalue of the viscous stress force on the lattice [1 / m2]
-    (`cortado.sph.stress_kernels`)."""
+    """Return the greatest eigenvalue of the viscous stress force [1 / m2] (`cortado.sph.stress_kernels`)."""
     offsets, gradients, volume = _filled(kernel, spacing, support, dimension)
     others = np.any(offsets != 0.0, axis=1)
     offsets, gradients = offsets[others], gradients[others]

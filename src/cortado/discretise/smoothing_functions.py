@@ -96,17 +96,9 @@ RADIAL_FUNCTIONS = {
 
 @cache
 def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SimpleNamespace:
-    """Build Warp functions of a separation x [m], the inverse support radius [1/m] and the normalisation of the kernel
-    [1 / m^d]:
-
-    - ``weight`` returns the kernel.
-    - ``slope`` returns the factor a in the kernel's gradient a x.
-    - ``slope_change`` returns the derivative of a along a vector u.
-    - ``slope_gradient`` returns the gradient of a.
-    - ``gradient`` returns the gradient of the kernel.
-
-    A tape can differentiate the functions if ``taped`` is true.
-    """
+    """The functions take a separation x [m], the inverse support radius [1/m] and the normalisation [1 / m^d].
+    ``slope`` is the factor a in the kernel's gradient a x, and ``slope_change`` is the derivative of a along a vector
+    u. A tape can differentiate ``taped`` functions."""
     real, vector = precision.real, precision.vector
     value, gradient_factor, hessian_factor = RADIAL_FUNCTIONS[kernel.name](precision)
     functions = arithmetic(precision, taped)
@@ -115,8 +107,7 @@ def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bo
 
     @wp.func
     def square(x: vector, per_h: real) -> real:
-        """Return the squared distance relative to the support radius. A tiny number is added, so that the result has a
-        finite reciprocal."""
+        """A tiny number is added, so that the result has a finite reciprocal."""
         return wp.dot(x, x) * (per_h * per_h) + tiny
 
     @wp.func

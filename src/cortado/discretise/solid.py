@@ -32,7 +32,6 @@ class Faces:
         return Faces(self.vertices @ turn.T + position, self.corners)
 
     def reversed(self) -> "Faces":
-        """Return the faces with inside and outside exchanged."""
         return Faces(self.vertices, self.corners[:, ::-1])
 
 
@@ -60,8 +59,7 @@ class Moments:
 
 
 def enclosed_moments(corners: Points, weights: Points) -> Moments:
-    """Return the moments of a body enclosed by edges (k, 2, 2) or triangles (k, 3, 3) [m], by surface integrals
-    (Mirtich 1996). Each face has a weight (k,). Faces are counterclockwise as seen from outside."""
+    """Integrate over edges (k, 2, 2) or triangles (k, 3, 3) [m], counterclockwise from outside (Mirtich 1996)."""
     d = corners.shape[1]
     origin = whole_origin(corners.reshape(-1, d))
     about = corners - origin
@@ -98,7 +96,6 @@ class Solid(ABC):
         """Return flat faces of the surface, about ``fine`` [m] wide on curved parts."""
 
     def moments(self) -> Moments:
-        """Return the volume, the centroid and the second moments of the solid."""
         raise NotImplementedError(f"{type(self).__name__} has no moments")
 
     def shown_faces(self, fine: float) -> Faces:
@@ -110,8 +107,7 @@ class Solid(ABC):
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Return evenly spread points on the surface (n, d) [m], about ``fine`` [m] apart, and the outward unit vectors
-        (n, d). Returns None if the points must be found from a lattice around the solid."""
+        """Also return outward unit vectors. Return None if points must be found from a lattice around the solid."""
         return None
 
     def outward(self, points: Points) -> Points:
@@ -197,8 +193,7 @@ class Mass:
     volume: float
     """Volume [m^d]."""
     inertia: Points
-    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only the component about z is
-    not 0."""
+    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only the part about z is not 0."""
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":
@@ -209,5 +204,4 @@ class Mass:
         return cls(moments.volume, about - moments.second)
 
     def in_volumes(self, unit: float) -> "Mass":
-        """Return the volume and the inertia divided by ``unit`` [m^d]."""
         return Mass(self.volume / unit, self.inertia / unit)

@@ -20,8 +20,7 @@ Near = Callable[[Points, float], Which]
 FINE = {2: 12, 3: 3}
 """Number of candidate points on a surface per spacing, by dimension."""
 CELLS = (3, 4)
-"""Number of subdivisions of a cell along each axis, in two successive refinements near a surface. The last number must
-be even."""
+"""Subdivisions of a cell along each axis, in two refinements near a surface. The last number must be even."""
 APART, LEAST_APART = 0.78, 0.65
 """Least distance between chosen points, and least distance after the points are moved [spacings]."""
 FIRST, GROWTH = 0.05, 1.7
@@ -38,17 +37,13 @@ SEED = 1
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points on a surface, with the area of each point."""
-
     points: Points
-    """Points (n, d) [m]."""
     shares: Points
     """Areas of the points (n,), relative to the area of a lattice point."""
 
 
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
-    """Return points about a spacing [m] apart, ``depth`` [m] below the surface of a solid. With a negative depth the
-    points are above the surface. In thin parts of the solid the points are in the middle."""
+    """``depth`` [m] is negative above the surface. In thin parts of the solid the points are in the middle."""
     fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
     points, tolerance = feet - depth * away, 1e-3 * depth
@@ -66,12 +61,9 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
-    """Choose points about a spacing [m] apart from candidates on a surface (n, d) [m], which are ``fine`` [m] apart.
-
-    First, as many points as possible are chosen at a least distance. Each point then moves to the candidate nearest to
-    the centroid of its closest candidates (Lloyd 1982). Finally, points that are too close are removed and gaps are
-    filled.
-    """
+    """First, as many points as possible are chosen at a least distance. Each point then moves to the candidate nearest
+    to the centroid of its closest candidates (Lloyd 1982). Finally, points that are too close are removed and gaps are
+    filled. ``fine`` [m] is the distance between candidates."""
     dimension = candidates.shape[1]
     if not len(candidates):
         return SurfacePoints(candidates, np.zeros(0))
@@ -91,8 +83,7 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
-    """Return points on the surface of a solid (n, d) [m], about ``fine`` [m] apart, and the outward unit vectors (n,
-    d). Points that fail the test ``is_near`` may be left out."""
+    """Also return outward unit vectors (n, d). Points that fail the test ``is_near`` may be left out."""
     found = solid.own_feet(fine)
     if found is not None:
         return found
@@ -119,9 +110,8 @@ def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tupl
 
 
 def lattice_about(lower: Points, upper: Points, reach: float, fine: float, is_near: Near) -> Iterator[Points]:
-    """Yield the lattice points (n, d) near an object in a box, in portions. All points within ``reach`` [m] of the
-    object are included. ``fine`` is the spacing of the lattice [m], and ``is_near`` tests which points are near the
-    object."""
+    """Yield portions of a lattice with all points within ``reach`` [m] of the object that ``is_near`` tests. ``fine``
+    is the spacing of the lattice [m]."""
     dimension, size = len(lower), int(np.prod(CELLS)) * fine
     cells = block_about(0.5 * (lower + upper), 0.5 * (upper - lower) + reach + size, size).points()
     *coarse, last = CELLS
@@ -146,8 +136,7 @@ def _divided(cells: Points, size: float, parts: int) -> Points:
 
 
 def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Numbers:
-    """Choose more points, in the given ``order``, that are further than ``apart`` [m] from all ``chosen`` points.
-    Return the indices of all chosen points."""
+    """Add points, in the given ``order``, that are further than ``apart`` [m] from all ``chosen`` points."""
     from scipy.spatial import cKDTree
 
     size = int(FIRST * len(order)) + 1
@@ -172,8 +161,7 @@ def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Nu
 
 
 def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
-    """Return the distances (n,) from ``some`` points (n, d) [m] to the nearest of ``points`` (m, d) [m], and the
-    indices of the nearest points (n,). Distances beyond ``reach`` [m] are infinite."""
+    """Return the distance from each of ``points`` to the nearest of ``some``, or infinity, and the nearest's index."""
     from scipy.spatial import cKDTree
 
     workers = usable_cores() if len(points) > MANY else 1
@@ -186,7 +174,6 @@ class WallPoints(Rows):
     """Wall particles without their final weights."""
 
     positions: Points
-    """Positions (b, d) [m]."""
     flat: Points
     """Weights of the particles in the density next to a flat wall (b,) [-]."""
     feet: Points
@@ -195,8 +182,7 @@ class WallPoints(Rows):
 
 @dataclass(frozen=True, eq=False)
 class ContainerWalls:
-    """The wall particles of a container before solids are added to it. Wall particles far from all solids keep their
-    positions."""
+    """The wall particles of a container before solids are added to the container."""
 
     points: WallPoints
     solids: Sequence[Solid]
@@ -213,13 +199,11 @@ class ContainerWalls:
 
     @cached_property
     def stay(self) -> Which:
-        """Test (b,) which wall particles keep their positions."""
         feet = self.points.positions + self.points.feet
         return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
 
     def keeps(self, points: Points) -> Which:
-        """Test (n,) which points (n, d) [m] are near a wall particle that keeps its position, or above the rim of the
-        container."""
+        """Test which points are near a wall particle that keeps its position, or above the container's rim."""
         from scipy.spatial import cKDTree
 
         kept = np.asarray(self.room.from_solids(points, self.spacing) > 0.0)
@@ -229,8 +213,7 @@ class ContainerWalls:
         return kept
 
     def is_near(self, points: Points, furthest: float) -> Which:
-        """Test (n,) which points (n, d) [m] may be closer than ``furthest`` [m] to a solid or to moved wall
-        particles."""
+        """Test which points may be closer than ``furthest`` [m] to a solid or to moved wall particles."""
         near = self._clear + 2.0 * self.spacing + furthest
         return np.asarray(self.room.from_solids(points, near) < near)
 
@@ -248,8 +231,7 @@ EXPOSED_HALVINGS, EXPOSED_ROUNDS, DIGITS = 12, 30, 4
 
 @dataclass(frozen=True)
 class ExposedSurface:
-    """Closely spaced points on the surface that fluid can touch. The surface consists of the surfaces of solids, and of
-    the container's surface near solids."""
+    """Closely spaced points where fluid can touch solids, or can touch the container near solids."""
 
     feet: Points
     """Points on the surface (n, d) [m]."""
@@ -265,8 +247,7 @@ class ExposedSurface:
 
     @classmethod
     def of(cls, container: ContainerWalls, solids: Sequence[Solid], lower: Points) -> "ExposedSurface":
-        """Find closely spaced points on the surface that fluid can touch. Along periodic axes the surface extends one
-        support radius beyond the periodic box. ``lower`` (d,) [m] is the lower corner of the periodic box."""
+        """Along periodic axes the surface extends one support radius beyond the periodic box."""
         fine = container.spacing / FINE[len(lower)]
         found = [surface_feet(side, fine, container.is_near) for side in container.solids]
         found += [surface_feet(solid, fine) for solid in solids]
@@ -287,8 +268,7 @@ class ExposedSurface:
         return cKDTree(self.feet)
 
     def walls(self, lattice: RestLattice) -> WallPoints:
-        """Build wall particles at the depths of a flat wall's layers. The weight of a wall particle is proportional to
-        its area, and is reduced near the surface."""
+        """The weight of a wall particle is proportional to its area, and is reduced near the surface."""
         parts, spacing = [], lattice.spacing
         for depth, weight in zip(lattice.layers.depths, lattice.layers.weights, strict=True):
             found = self.beneath(depth)
@@ -342,8 +322,7 @@ class ExposedSurface:
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
-        """Return the nearest points on the surface (n, d) [m] to points (n, d) [m] below the surface. ``nearest`` (n,)
-        is the index of the nearest fine point, and ``reach`` (n,) [m] is its distance."""
+        """``nearest`` (n,) is the index of the nearest fine point, and ``reach`` (n,) [m] is its distance."""
         fine = self._fine
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
@@ -362,8 +341,7 @@ class ExposedSurface:
         return found
 
     def _edges(self, feet: Points, owner: Numbers) -> Points:
-        """Return points (n, d) [m] on the edges where two solids meet, by alternating projection onto the two surfaces.
-        ``owner`` (n,) is the solid of each starting point in ``feet`` (n, d) [m]."""
+        """Return points on edges of two solids, by alternating projection. ``owner`` (n,) is each point's solid."""
         distances = np.abs([solid.distance(feet) for solid in self.solids])
         distances[owner, np.arange(len(feet))] = np.inf
         other, found = np.argmin(distances, axis=0), feet.copy()
@@ -381,22 +359,19 @@ class ExposedSurface:
 
 
 def _within_a_period(points: Points, lower: Points, periods: Points, reach: float) -> Which:
-    """Test (n,) which points (n, d) [m] are inside the periodic box or at most ``reach`` [m] outside. ``lower`` (d,)
-    [m] is the lower corner of the box."""
+    """Test (n,) which points are inside the periodic box or at most ``reach`` [m] outside."""
     within = (points >= lower - reach) & (points < lower + periods + reach)
     return np.asarray((within | (periods == 0.0)).all(axis=1))
 
 
 def _is_exposed(feet: Points, away: Points, container: ContainerWalls) -> Which:
-    """Test (n,) at which surface points (n, d) [m] fluid can touch the surface. ``away`` (n, d) has the outward unit
-    vectors of the solids."""
+    """Test (n,) where fluid can touch the surface. ``away`` (n, d) has outward unit vectors of the solids."""
     spacing = container.spacing
     return container.room.contains(feet + 2.0 * MARGIN * spacing * away, -MARGIN * spacing)
 
 
 def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
-    """Return points where a lattice of fluid may rest beside a solid, up to ``reach`` [m] from its surface. The first
-    points are half a spacing from the surface, and further points follow at each spacing."""
+    """The first points are half a spacing from the surface, and further points follow at each spacing."""
     heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
     points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
     return Places(points, frames(solid.outward(points)))

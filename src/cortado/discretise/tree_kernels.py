@@ -70,8 +70,7 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
-    """For each point, find the nearest point on the triangles and the squared distance. If no triangle is within the
-    distance ``reach``, the given point itself is stored."""
+    """If no triangle is within the distance ``reach``, the given point itself is stored."""
     i = first + wp.tid()
     p = points[i]
     best = reach * reach
@@ -150,8 +149,7 @@ def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
 @wp.kernel(module=_module, enable_backward=False)
 @typed.arrays
 def find_windings(first: int, points, boxes, starts, corners, leaves: int, windings):
-    """Compute the winding numbers of closed surfaces around points. The winding number is 1 inside a surface with
-    outward normals."""
+    """The winding number is 1 inside a surface with outward normals."""
     i = first + wp.tid()
     p = points[i]
     total = int(0)
@@ -175,8 +173,7 @@ def find_windings(first: int, points, boxes, starts, corners, leaves: int, windi
 
 @wp.func
 def pierces(p: vector, q: vector, a: vector, b: vector, c: vector, tolerance: real) -> wp.bool:
-    """Test whether a line segment passes through the interior of a triangle. The ends of the segment must be further
-    than ``tolerance`` from the triangle's plane."""
+    """The ends p and q of the segment must be further than ``tolerance`` from the triangle's plane."""
     normal = wp.cross(b - a, c - a)
     size = wp.length(normal)
     above = wp.dot(normal, p - a)
@@ -202,8 +199,7 @@ def has(names: wp.vec3i, name: wp.int32) -> wp.bool:
 def some_edge_pierces(
     corners: wp.array2d(dtype=vector), names: wp.array(dtype=wp.vec3i), s: wp.int32, t: wp.int32, tolerance: real
 ) -> wp.bool:
-    """Test whether an edge of triangle s passes through triangle t. Edges that share a vertex with triangle t are
-    ignored."""
+    """Edges of triangle s that share a vertex with triangle t are ignored."""
     found = wp.bool(False)
     for k in range(3):
         following = (k + 1) % 3
@@ -219,9 +215,8 @@ def some_edge_pierces(
 def find_crossings(
     first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
-    """For each triangle, find the triangles that cross it and have a higher number. For triangle i, the numbers found
-    are written to ``others``, from index ``places[i]`` up to ``places[i + 1]``. Crossings beyond this range are only
-    counted in ``counts``."""
+    """For triangle i, the higher numbers of crossing triangles are written to ``others``, from index ``places[i]`` up
+    to ``places[i + 1]``. Crossings beyond this range are only counted in ``counts``."""
     i = first + wp.tid()
     low = wp.min(corners[i, 0], wp.min(corners[i, 1], corners[i, 2]))
     high = wp.max(corners[i, 0], wp.max(corners[i, 1], corners[i, 2]))
@@ -253,8 +248,7 @@ def find_crossings(
 
 
 MARGIN = {"float64": 1e-6, "float32": 1e-3}
-"""Distance by which faces extend beyond their boundaries [spacings]. The distance exceeds round-off up to 1,000
-spacings from the origin."""
+"""Faces extend beyond their boundaries by more than round-off at 1,000 spacings from the origin [spacings]."""
 AROUND = 1e-3
 """Margin around a line segment in the search for nearby faces, which uses float32 [spacings]."""
 
@@ -284,9 +278,8 @@ def faces_type(precision: Precision) -> Any:
 
 @cache
 def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
-    """Build Warp functions for points relative to the centre of a sheet. ``query`` finds the faces in a box around two
-    points. ``meets`` tests whether a line segment crosses a given face. ``goes_through`` tests whether a line segment
-    crosses any face."""
+    """Points are relative to the centre of a sheet. ``query`` finds the faces in a box around two points, ``meets``
+    tests a given face, and ``goes_through`` tests all faces of a sheet."""
     real, vector, faces_of = precision.real, precision.vector, faces_type(precision)
 
     @wp.func
@@ -323,8 +316,7 @@ def face_functions(precision: Precision) -> tuple[Any, Any, Any]:
 
 
 def faces_on(sheets: Sequence[tuple[Points, Points]], spacing: float, precision: Precision, device: Any) -> Any:
-    """Build the Warp struct of the faces of all sheets. Each sheet has face corners (k, d, d) [m] and unit normals (k,
-    d). Also return the search trees of the struct, which the caller must keep alive."""
+    """Sheets are face corners (k, d, d) [m] and unit normals (k, d). The caller must keep the search trees alive."""
     made, trees, middles, rows = faces_type(precision)(), [], [], []
     for corners, normals in sheets:
         middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))

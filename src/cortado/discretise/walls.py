@@ -17,16 +17,12 @@ if TYPE_CHECKING:
 
 
 def nearest_cells(length: float, spacing: float) -> int:
-    """Return the number of cells of size ``spacing`` that fits a length [m] best, at least 1."""
     return max(int(np.floor(length / spacing + 0.5)), 1)
 
 
 def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
-    """Return one layer of points (n, d) around a box, ``depth`` [m] outside. Periodic axes have no wall.
-
-    The points continue the lattice inside the box. The lattice is slightly stretched if a side is not a multiple of the
-    spacing.
-    """
+    """Return one layer of points (n, d) around a box, ``depth`` [m] outside, except along periodic axes. The points
+    continue the lattice inside the box, stretched slightly if a side is not a multiple of the spacing."""
     inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
     outside = [
         np.zeros(0) if open_axis else np.array([a - depth, b + depth])
@@ -37,12 +33,9 @@ def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: f
 
 
 def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: float) -> Points:
-    """Return one layer of wall particles (n, 3) around an upright cup. The centre of the cup's base is at the origin,
-    and its height is along the third axis.
-
-    The side wall consists of rings about a spacing apart, at the distance ``depth`` [m] outside the cup. The base and
-    the lid continue the lattice of the fluid, with an additional ring at the side wall.
-    """
+    """Return one layer of points (n, 3) around an upright cup, with the centre of the cup's base at the origin. The
+    side wall consists of rings at the distance ``depth`` [m] outside the cup. The base and the lid continue the lattice
+    of the fluid, with an additional ring at the side wall."""
     side = ring(radius + depth, spacing)
     end = np.concatenate([disc(radius, spacing, 2), side])
     ends = [-depth, height + depth] if lid else [-depth]
@@ -51,7 +44,6 @@ def cup_walls(radius: float, height: float, lid: bool, spacing: float, depth: fl
 
 
 def ring(radius: float, spacing: float) -> Points:
-    """Return points on a circle (n, 2), about a spacing apart."""
     count = max(nearest_cells(2.0 * np.pi * radius, spacing), 3)
     angles = 2.0 * np.pi * np.arange(count) / count
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -74,7 +66,6 @@ class Places(Rows):
     """Points beside walls where fluid may rest. Each point has the axes of its local particle lattice."""
 
     points: Points
-    """Positions of the points (n, d) [m]."""
     axes: Points
     """Unit vectors along the axes of each point's lattice (n, d, d)."""
 
@@ -85,8 +76,7 @@ class Places(Rows):
 
 
 def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, reach: float) -> Places:
-    """Return points less than ``reach`` [m] from a wall of a box, where fluid may rest. The points nearest to a wall
-    are half a spacing from the wall."""
+    """Return points less than ``reach`` [m] from a wall. The points nearest to a wall are half a spacing away."""
     every = [_between(a, b, open_axis, spacing) for a, b, open_axis in zip(lower, upper, periodic, strict=True)]
     beside = [
         np.zeros(len(x), dtype=bool) if open_axis else np.minimum(x - a, b - x) < reach
@@ -98,12 +88,9 @@ def box_places(lower: Points, upper: Points, periodic: Sequence[bool], spacing: 
 
 
 def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: float) -> Places:
-    """Return points less than ``reach`` [m] from a wall of an upright cup, where fluid may rest. The centre of the
-    cup's base is at the origin, and its height is along the third axis.
-
-    Lattices near the side of the cup are aligned with the side. Points at the base and at the lid lie on the lattice of
-    the fluid in the cup. The top of an open cup has no points.
-    """
+    """Return points less than ``reach`` [m] from a wall of the cup in `cup_walls`. Lattices near the side of the cup
+    are aligned with the side. Points at the base and at the lid lie on the lattice of the fluid. The top of an open cup
+    has no points."""
     levels = _between(0.0, height, False, spacing)
     closed = levels if lid else levels[levels < height - reach]
     ends = closed[np.minimum(closed, height - closed) < reach] if lid else closed[closed < reach]
@@ -118,8 +105,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
 
 
 def _between(lower: float, upper: float, periodic: bool, spacing: float) -> Points:
-    """Return lattice coordinates between two walls, starting half a spacing from each wall. Along a periodic axis the
-    coordinates are evenly spaced."""
+    """The coordinates start half a spacing from each wall, or are evenly spaced along a periodic axis."""
     count = nearest_cells(upper - lower, spacing)
     cells = np.arange(count, dtype=np.float64) + 0.5
     if periodic:
@@ -135,12 +121,9 @@ WHOLE = 1e-9
 def short_box(
     lower: Points, upper: Points, spacing: float, support: float
 ) -> tuple[Points, Callable[[Points], Points]]:
-    """Shorten a box between corners (d,) [m], by removing cells from the middle of its long sides. The weights of wall
-    particles do not change, because they are constant far from edges.
-
-    Return the upper corner of the short box (d,) [m], and a function that maps points on the walls (n, d) [m] to the
-    short box.
-    """
+    """Remove cells from the middle of the long sides of a box. The weights of wall particles far from edges are
+    constant, and do not change. Return the upper corner of the short box (d,) [m], and a function that maps points on
+    the walls (n, d) [m] to the short box."""
     ends, lengths = int(np.ceil(ENDS * support / spacing)), upper - lower
     cells = np.array([nearest_cells(length, spacing) for length in lengths])
     whole = np.abs(lengths / spacing - cells) < WHOLE * cells
@@ -157,8 +140,7 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer of wall particles [spacings]. The layer exists only if the smoothing kernel of the second
-fluid layer reaches the wall."""
+"""Depth of the shallow layer, which exists only if the second fluid layer's kernel reaches the wall [spacings]."""
 
 
 @dataclass(frozen=True)
@@ -175,14 +157,11 @@ class WallLayers:
 class RestLattice:
     kernel: SmoothingKernel
     spacing: float
-    """Particle spacing [m]."""
     support: float
-    """Support radius [m]."""
     dimension: int
 
     @cached_property
     def offsets(self) -> Points:
-        """Return the vectors from a lattice point to all lattice points within the support radius (m, d) [m]."""
         return lattice_offsets(self.spacing, self.support, self.dimension)
 
     def weights(self, separations: Points) -> Points:
@@ -190,8 +169,7 @@ class RestLattice:
         return self.kernel.weight(np.linalg.norm(separations, axis=1), self.dimension, self.support)
 
     def sums(self, separations: Points) -> Points:
-        """Return the smoothing kernel, and its gradient times the spacing, at separations (m, 1 + d) [-]. The results
-        are divided by the kernel's sum over the lattice."""
+        """Return the kernel, and its gradient times the spacing (m, 1 + d), over the sum on the lattice [-]."""
         gradients = self.kernel.gradient(separations, self.support)
         both = np.column_stack([self.weights(separations), self.spacing * gradients])
         return np.asarray(both / self.weights(self.offsets).sum())
@@ -250,8 +228,7 @@ STIFFNESS = 3e-3
 UNEVEN_STIFFNESS = 0.06
 """Penalty like `STIFFNESS`, for wall particles that are not on a lattice. A smaller penalty would let fluid leak."""
 LEAST, ROUNDS = 0.6, 4
-"""Least weight of wall particles that are not on a lattice, relative to a flat wall. ``ROUNDS`` is the number of
-iterations that impose this bound."""
+"""Least weight of wall particles off lattices, relative to a flat wall, and iterations that impose this bound."""
 BALANCE = 0.02
 """Least-squares weight of the force from a uniform pressure, relative to density errors. Smaller weights let fluid
 leak, and larger weights make corners too dense."""
@@ -292,23 +269,13 @@ def wall_weights(
     known: int = 0,
     crossed: Crossed | None = None,
 ) -> Points:
-    """Compute the weights of wall particles in the density (b,) [-], relative to a fluid particle.
+    """Fit the weights of wall particles (b,), relative to a fluid particle, by least squares. The lattice has the rest
+    density at all places. A uniform pressure pushes no particle less than a spacing from a wall, as in
+    `RestLattice.layers`.
 
-    The weights are fitted by least squares to two conditions. The lattice has the rest density at all places. A uniform
-    pressure pushes no particle less than a spacing from a wall, as in `RestLattice.layers`.
-
-    Args:
-        walls: (b, d) wall particles [m].
-        flat: (b,) weights of the wall particles in a flat wall [-]. The last ``known`` weights are final.
-        places: places where fluid may rest.
-        lattice: the lattice of the fluid at rest.
-        room: the region that fluid can fill.
-        lower: (d,) lower corner of the periodic box [m].
-        are_even: True if the wall particles are on lattices. The weights are then at least 0, and otherwise at least
-            `LEAST` times the weights in a flat wall.
-        known: number of wall particles with known weights, which come last.
-        crossed: test for line segments that cross a sheet, given if the wall particles belong to a sheet. Fluid
-            interacts with these particles only across the sheet.
+    ``flat`` (b,) are the weights in a flat wall, of which the last ``known`` weights are final. If the wall particles
+    are on lattices (``are_even``), weights are at least 0, and otherwise at least `LEAST` times ``flat``. ``crossed``
+    is given for the wall particles of a sheet, with which fluid interacts only across the sheet.
     """
     from scipy.sparse import coo_array, vstack
 
@@ -318,8 +285,7 @@ def wall_weights(
     is_sheet[:sought] = crossed is not None
 
     def demands(places: Places) -> tuple["csr_array", Points]:
-        """Return the matrix (m, b) and the right-hand side (m,) of the least-squares fit. The unknowns are the weights
-        relative to flat walls."""
+        """Return the matrix (m, b) and the right-hand side (m,) of the fit. The unknowns are relative to flat walls."""
         place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
         if crossed is not None:
             seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
@@ -343,8 +309,7 @@ def wall_weights(
 
 
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Fit the relative changes (b,) of flat-wall weights, for wall particles on lattices. The least-squares equations
-    are ``sums @ changes = wanted``. The new weights are at least 0."""
+    """Solve ``sums @ changes = wanted`` for relative changes of flat-wall weights. New weights are at least 0."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 
@@ -355,8 +320,7 @@ def even_changes(sums: "csr_array", wanted: Points) -> Points:
 
 
 def uneven_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Fit the relative changes (b,) of flat-wall weights as in `even_changes`, for wall particles that are not on a
-    lattice. The new weights are at least `LEAST` times the flat-wall weights."""
+    """Solve like `even_changes`. New weights are at least `LEAST` times the flat-wall weights."""
     from scipy.sparse.linalg import lsmr
 
     changes, free = np.zeros(sums.shape[1]), np.ones(sums.shape[1], dtype=bool)

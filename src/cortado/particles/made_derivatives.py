@@ -50,8 +50,7 @@ def made_adjoint(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
 
 
 def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
-    """Make the Warp function of the tangent of a sum over neighbours. In the arguments of this function, each input of
-    the sum is followed by its tangent."""
+    """In the arguments of the Warp function, each input of the sum is followed by its tangent."""
     term = _differentiable(make, d)
     arrays, others = (
         {each: kind for name, kind in types.items() for each in (name, f"{name}_dot")}

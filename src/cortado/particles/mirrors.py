@@ -26,8 +26,7 @@ FACES, MOST_FACES = 64, 64
 NUMBERS = 2**31
 CONTAINER = -1
 NOTHING = ALL_WALLS = -NUMBERS
-"""Special value in place of the number of a solid. Depending on the name, the value stands for no solid or for all
-walls."""
+"""These values replace the number of a solid. They stand for no solid and for all walls."""
 
 
 def reflections(moving: bool) -> int:
@@ -57,7 +56,6 @@ OWNED = "wp.where(_mirrors_by(_one, solid, s), _real(1.0), _real(0.0))"
 
 
 def mirror_functions(precision: Precision, moving: bool, neighbourhood: Any) -> dict[str, Any]:
-    """Make the Warp functions of mirrors by name, for scenes with or without moving solids."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     turning = matrix if moving else vector
 

@@ -41,8 +41,7 @@ class WallArrays(Rows):
     """Number (b,) of the solid: 0, 1, ... for moving solids, -2, -3, ... for solids at rest, and -1 for the
     container."""
     faces: np.ndarray
-    """Number (b,) of the flat face that mirrors the fluid in front of the wall particle. Without such a face the number
-    is -1."""
+    """Number (b,) of the flat face that mirrors the fluid in front of the wall particle, or -1."""
 
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
@@ -65,8 +64,7 @@ def resting_pose(layout: Layout) -> dict[str, wp.array]:
 
 @cache
 def turn_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions: one converts the adjoint of a rotation matrix to the adjoint of a rotation vector, and
-    the other converts in the opposite direction."""
+    """The functions convert adjoints of a rotation matrix to adjoints of a rotation vector, and back."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
@@ -174,11 +172,8 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
 
 
 class MovingWalls:
-    """The wall particles of moving solids."""
-
     def __init__(self, walls: WallArrays, first: int, solids: int, dimension: int, grid: Grid, layout: Layout):
-        """Store the ``walls`` of moving solids. ``solids`` is the number of moving solids, and ``first`` is the index
-        of the first wall particle in the arrays of the neighbour search."""
+        """``first`` is the index of the first wall particle in the arrays of the neighbour search."""
         precision, device, count = layout.precision, layout.device, len(walls)
         self.solids, self.named = solids, pose_arrays(layout.members, solids, precision, device)
         self.sizes = sizes_type(precision)()

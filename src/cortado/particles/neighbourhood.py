@@ -16,8 +16,7 @@ from cortado.particles.mirrors import mirror_functions
 
 @cache
 def loads(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make the Warp functions that load one element of a list [neighbour, particle] or of a contiguous array. Indices
-    must not be negative. ``taped`` functions can be recorded by a Warp tape."""
+    """Indices must not be negative. A Warp tape can record ``taped`` functions."""
     return _of_warp(precision) if taped else _direct(precision)
 
 
@@ -78,8 +77,7 @@ class Discretisation:
     periodic: bool = False
     moving: bool = False
     taped: bool = False
-    """True if a Warp tape differentiates the forward kernels. Forward kernels then need a single thread per
-    particle."""
+    """True if a Warp tape differentiates the forward kernels, which then need a single thread per particle."""
 
     @property
     def types(self) -> tuple[Any, Any, Any]:
@@ -91,11 +89,9 @@ class Discretisation:
 
     @property
     def still(self) -> "Discretisation":
-        """Return a copy with walls at rest."""
         return replace(self, moving=False)
 
     def module(self, forward: bool, topic: str) -> Any:
-        """Return the Warp module of forward or adjoint kernels for a ``topic``, such as a solver."""
         return self._module(kind_of(forward, self.taped), topic, forward and self.taped)
 
     def tangent_module(self, topic: str) -> Any:
@@ -115,7 +111,7 @@ class Discretisation:
 
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
-    """Make the Warp struct of a neighbourhood. The arrays of a neighbourhood are sorted by cell."""
+    """The arrays of a neighbourhood are sorted by cell."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Neighbourhood:
@@ -158,8 +154,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         self_weight: real
         """Smoothing kernel at distance 0 [1 / m^d]."""
         response_scale: real
-        """Inverse square root of the sum of squared kernel gradients over all neighbours of a particle inside the fluid
-        [m^(d + 1)]."""
+        """Inverse square root of `cortado.discretise.smoothing.wall_response` [m^(d + 1)]."""
         laplacian_correction: real
         """Correction factor of second derivatives [-]. See `cortado.discretise.smoothing`."""
         volume: real
@@ -180,8 +175,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Matrix for each face, in the frame of its solid. The rows of the matrix are the normal towards the fluid and
         two unit vectors along the face."""
         face_sizes: wp.array(dtype=vector)
-        """Vector (0, a, b) for each face, where a and b are half the lengths of the face along its two unit vectors
-        [m]."""
+        """Vector (0, a, b) for each face, with half the lengths a and b along the face's two unit vectors [m]."""
         wall_faces: wp.array(dtype=wp.int32)
         after: wp.array2d(dtype=vector)
         """Positions of the middles of solids after the time step (members, solids) [m]."""

@@ -56,8 +56,7 @@ def scan_types(discretisation: Discretisation) -> TypesByName:
 
 @cache
 def scan_by_bits(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends the neighbours among the particles from ``first`` to ``last`` - 1, except
-    ``own``. The function uses one thread per particle."""
+    """One thread per particle appends the neighbours from ``first`` to ``last`` - 1, except ``own``."""
     pair = pair_functions(discretisation)
     separation, load = pair.separation, pair.load_vector
 
@@ -123,7 +122,6 @@ def scan_by_lanes(discretisation: Discretisation) -> Any:
 
 @cache
 def scan_by_rows(discretisation: Discretisation) -> Any:
-    """Make the Warp function that appends neighbours in the cells around cell c."""
     cells = cell_functions(discretisation.precision)
     wrap, below, above = cells.wrap, cells.below, cells.above
     scan = scan_by_bits(discretisation) if discretisation.lanes == 1 else scan_by_lanes(discretisation)
@@ -221,8 +219,7 @@ def fill_kernel(discretisation: Discretisation) -> Any:
 
     @typed.kernel(discretisation.module(True, "neighbours"), enable_backward=False)
     def fill(s, grid, wall_grid, moving_grid, near_walls, bad_step, x, fluid_count, filling, count, all_count, needed):
-        """Write the lists of neighbours. The greatest length of a list is written to ``needed``, even if it exceeds the
-        capacity."""
+        """The greatest length of a list is written to ``needed``, even if the length exceeds the capacity."""
         i = s.first + wp.tid() // LANES
         member = i // s.particles
         if bad_step[member] >= 0:
@@ -299,11 +296,8 @@ def image_kernel(discretisation: Discretisation) -> Any:
 
 
 class NeighbourSearch:
-    """A search that sorts particles by cell and lists their neighbours on one device.
-
-    Lists are stored as [particle][neighbour] on a CPU and as [neighbour][particle] on a GPU. Kernels always index
-    [neighbour, particle].
-    """
+    """Lists are stored as [particle][neighbour] on a CPU and as [neighbour][particle] on a GPU. Kernels always index
+    [neighbour, particle]."""
 
     def __init__(
         self,
@@ -316,8 +310,7 @@ class NeighbourSearch:
         dimension: int = 3,
         mirrored: bool = False,
     ):
-        """Allocate the arrays of the search for ``walls`` at rest and for ``solids`` moving solids. Lists contain
-        mirror images if fluid is ``mirrored``."""
+        """Lists contain mirror images if fluid is ``mirrored``."""
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         if mirrored and particles > (most := most_imaged(discretisation.moving)):
             raise InputError(
@@ -352,7 +345,6 @@ class NeighbourSearch:
         self._wall_sort = CellSort(grid, len(still), precision, device)
         self._unsorted_walls: WallArrays | None = still
         self.moving = MovingWalls(moving, len(still), solids, dimension, grid, layout) if solids else None
-        """Walls of moving solids."""
         self._grid, self._near_walls = grid, wp.zeros(grid.cells, dtype=wp.bool, device=device)
         self.allocate(capacity)
 

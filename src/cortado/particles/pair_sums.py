@@ -55,8 +55,6 @@ class Term:
 
     @classmethod
     def of(cls, function: Callable[..., Any]) -> "Term":
-        """Make a term from a function with annotated parameters. Raises `TypeError` for missing annotations and for
-        names that begin with an underscore."""
         types, names = inspect.get_annotations(function), (*inspect.signature(function).parameters, "return")
         for name in names:
             if name not in types or isinstance(types[name], str):
@@ -86,8 +84,7 @@ class Term:
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j", back: bool = False) -> str:
-        """Return the source text of the term's arguments for particle i and its neighbour. If ``back`` is true, the
-        roles of the two particles are exchanged."""
+        """Return the term's arguments as source text. With ``back``, the two particles exchange their roles."""
         known = {"x_ij": "_x_ij", "i": "i", "j": j, **OF_WALLS, **OF_IMAGES}
         if back:
             known = {"x_ij": "-_x_ij", "i": "_j", "j": "i"}
@@ -110,8 +107,7 @@ def own_entry(array: str) -> str:
 
 
 def between(parameter: str, own: str, other: str) -> str:
-    """Return the source text for a parameter. ``own`` is the text for the array's value at the particle, and ``other``
-    is the text for its value at the neighbour."""
+    """``own`` is source text for the particle's value, and ``other`` is source text for the neighbour's value."""
     texts = {"i": own, "j": other, "ij": f"{own} - {other}"}
     return texts[parameter.rpartition("_")[2]] if array_of(parameter) else parameter
 
@@ -156,10 +152,8 @@ Loops = Callable[[Term, Term], str]
 def over_fluid(
     term: Term, d: Discretisation, ahead: bool, arrays: Types | None = None, body: Body | None = None
 ) -> str:
-    """Return the text of a loop over fluid neighbours that reads ``arrays``. By default the loop adds up the term.
-
-    If ``ahead`` is true, the loop loads the values of `UNROLL` neighbours before it uses any of these values.
-    """
+    """Return the text of a loop over fluid neighbours that reads ``arrays``, and by default adds up the term. With
+    ``ahead``, the loop loads the values of `UNROLL` neighbours before it uses any of these values."""
     arrays, body = arrays or term.of_neighbours, body or _adding_up(term)
     kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
     loads = kinds if ahead else {}
@@ -174,8 +168,6 @@ def over_fluid(
 
 
 def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
-    """Return the source text of a loop over mirror images."""
-
     def of_j(array: str, kind: Any) -> str:
         of = array.removesuffix("_dot")
         if kind is d.precision.real or not _is_vector_of(d.precision.real, kind):
@@ -189,7 +181,6 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 
 def over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
-    """Return the source text of a loop over wall particles that adds up a term."""
     if "x_ij" not in wall.parameters:
         raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
     arrays = wall.of_neighbours
@@ -308,8 +299,7 @@ def image_sum(d: Discretisation, typed: Typed = None) -> Decorator:
 
 
 def image_sum_of_solid(total: Any) -> Any:
-    """Make the Warp function of a sum over the images by the walls of one solid. ``total`` is the sum over all images.
-    The number ``solid`` is an additional argument before s."""
+    """The number ``solid`` is an additional argument before s."""
     d, body = total.discretisation, _adding_up(total.term, f"{OWNED} * ")
     others, loop = {**total.others, "solid": int}, over_images(d, total.arrays, body)
     scope = {"_term": wp.func(total.term.function, module=total.module)}
@@ -317,8 +307,7 @@ def image_sum_of_solid(total: Any) -> Any:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
-    """Return a function that makes decorators for sums with friction. If fluid ``sticks`` to walls, the sums include
-    walls without slip."""
+    """If fluid ``sticks`` to walls, the sums include walls without slip."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, None, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, None, ahead)
@@ -327,8 +316,7 @@ def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
 
 
 def wall_sum(d: Discretisation, typed: Typed = None, grows: Any = None, weight: str = ALL) -> Decorator:
-    """Return a decorator that turns a term into its sum over wall particles. ``weight`` is the source text for the
-    weight of a wall particle."""
+    """``weight`` is the source text for the weight of a wall particle."""
     return _summing(d, typed, lambda _, wall: over_walls(wall, d, grows, weight), grows=grows)
 
 
@@ -352,8 +340,6 @@ def _added(called: str, term: Term, weight: str, arguments: str) -> list[str]:
 
 @dataclass(frozen=True)
 class ByHand:
-    """A handwritten derivative of a sum, as a Warp function."""
-
     kind: str
     """"tangent" or "adjoint"."""
     of: Any

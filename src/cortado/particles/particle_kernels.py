@@ -90,8 +90,7 @@ class Over:
 
 
 def over(function: Any, names: str, /, **renamed: str) -> Over:
-    """Describe a sum over neighbours for `particle_kernel`. ``names`` are the names of its results, separated by
-    spaces, and ``renamed`` gives the kernel's names for arguments of the sum."""
+    """``names`` are the results of the sum, separated by spaces. ``renamed`` are the kernel's names for arguments."""
     return Over(function, names.split(), renamed)
 
 
@@ -102,8 +101,7 @@ def dotted(names: Mapping[str, str]) -> dict[str, str]:
 def particle_kernel(
     module: Any, results: str, sums: Sequence[Over] = (), numbers: Names = (), name: str = "", typed: Typed = None
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that turns a function of one particle into a kernel in a Warp module. ``results`` are the
-    names of the arrays that the kernel writes, separated by spaces."""
+    """``results`` are the names of the arrays that the kernel writes, separated by spaces."""
 
     def make(function: Callable[..., Any]) -> Any:
         function = typed(function) if typed else function
@@ -122,8 +120,7 @@ def particle_kernel(
 def sum_kernel(
     name: str, module: Any, arrays: str, total: Any, times: str = "", per: str = "", numbers: Names = (), **renamed: str
 ) -> Any:
-    """Make the kernel that writes a sum over neighbours to ``arrays``. The sum is multiplied by the source text
-    ``times`` and divided by the source text ``per``."""
+    """The sum is multiplied by the source text ``times`` and divided by the source text ``per``."""
     arguments = _Arguments([Over(total, [f"total_{n}" for n in range(len(total.results))], renamed)], numbers)
     for number in numbers:
         arguments.entry(number, total.discretisation.precision.real)
@@ -136,12 +133,9 @@ def sum_kernel(
 def sum_kernels(
     name: str, modules: Modules, sums: Sequence[Any], result: str, before: str = "", written: Names = (), **named: Any
 ) -> Kernels:
-    """Make the kernels of a sum over neighbours, of its tangent and of its adjoint, in three Warp ``modules``.
-
-    The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``. ``before`` is an array. Adjoints are
-    added to the adjoints of the inputs, except for ``written`` arrays, which are overwritten. ``named`` are the other
-    arguments of `sum_kernel`.
-    """
+    """The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``, with the array ``before``. Adjoints
+    are added to the adjoints of the inputs, except for ``written`` arrays, which are overwritten. ``named`` are the
+    other arguments of `sum_kernel`."""
     total, tangent, adjoint = sums
     told = named | dotted({each: other for each, other in named.items() if each not in ("times", "per", "numbers")})
     numbers = named.get("numbers", ())
@@ -220,11 +214,9 @@ class _Arguments:
 def pointwise_kernels(
     precision: Precision, modules: Modules, make: Maker, results: Names, replaced: Types | None = None, **names: Any
 ) -> Kernels:
-    """Make the forward, tangent and adjoint kernels of a function of one particle, in three Warp ``modules``.
-
-    ``make(module)`` returns the function. ``results`` are the names of the arrays that it writes. ``replaced`` maps a
-    result to an input that shares its adjoint array. The remaining ``names`` are the fields of `Kinds`.
-    """
+    """``make(module)`` returns the function. ``results`` are the names of the arrays that the function writes.
+    ``replaced`` maps a result to an input that shares its adjoint array. The remaining ``names`` are the fields of
+    `Kinds`."""
     terms = [Term.of(make(module)) for module in modules]
     of = _Pointwise(precision, terms[0], results, Kinds(replaced or {}, **names), modules[0].options["enable_backward"])
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())
@@ -256,8 +248,7 @@ class Kinds:
     turned: Mapping[str, str] = field(default_factory=dict)
     """Names of rotation matrices, with the names of their tangents, which are rotation vectors."""
     read: Mapping[str, str] = field(default_factory=dict)
-    """Parameters that a kernel reads from a table (`cortado.sph.formula`), with the source text that reads the
-    value."""
+    """Parameters with the source text that reads their value from a table (`cortado.sph.formula`)."""
 
 
 class _Pointwise:

@@ -43,14 +43,12 @@ class PlacedSheet:
 
 @cache
 def sheets_type(precision: Precision) -> Any:
-    """Return the Warp struct of the edges or triangles of sheets."""
     return struct_of("Sheets", precision, faces=faces_type(precision), numbers=wp.array(dtype=wp.int32))
 
 
 @cache
 def sheet_functions(precision: Precision) -> tuple[Any, Any]:
-    """Make two Warp functions. ``scale_of`` returns the scale of a sheet, and ``seen_from`` converts a position to the
-    frame of a sheet."""
+    """``seen_from`` converts a position to the frame of a sheet."""
     real, vector, sheets_of = precision.real, precision.vector, sheets_type(precision)
     neighbourhood, poses = neighbourhood_type(precision), wp.array2d(dtype=vector)
     turnings = wp.array2d(dtype=precision.matrix)
@@ -87,8 +85,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def crossed(p: vector, q: vector, own: int, member: int, s: neighbourhood, sheets: sheets_of) -> int:
-        """Return 1 if a segment crosses the sheet with number ``own``, 2 if it crosses a different sheet, and 3 if it
-        crosses both."""
+        """Return 1 if a segment crosses the sheet ``own``, 2 if it crosses another sheet, and 3 for both."""
         found = int(0)
         for k in range(sheets.numbers.shape[0]):
             start = seen_from(p, s.before, s.turns_before, k, member, s, sheets)

@@ -51,8 +51,6 @@ class StateField:
 
 
 def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -> None:
-    """Raise `TypeError` if two fields have the same name, or if the parameter with a first value does not match its
-    field."""
     names: set[str] = set()
     for field in fields:
         if field.name in names:
@@ -126,8 +124,7 @@ class Arrays(Staying):
         return list(self._arrays.values())
 
     def named(self, suffix: str = "") -> dict[str, wp.array]:
-        """Return the arrays by kernel argument name, such as ``drag_k`` for ``drag.k``. The ``suffix`` is "_dot" for
-        tangents and "_bar" for adjoints."""
+        """Names are kernel arguments, such as ``drag_k`` for ``drag.k``. A ``suffix`` is "_dot" or "_bar"."""
         if suffix not in self._named:
             self._named[suffix] = {argument(name) + suffix: array for name, array in self._arrays.items()}
         return self._named[suffix]
@@ -172,8 +169,7 @@ class State(Arrays):
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
-        """Make a state from the arrays of declared fields. ``batch`` is the number of scenes, or None for a single
-        scene."""
+        """``batch`` is the number of scenes, or None for a single scene."""
         super().__init__(arrays)
         self.fields, self.batch = fields, batch
         self._narrow: dict[int, dict[str, Any]] = {}
@@ -212,16 +208,14 @@ class State(Arrays):
         return type(self)(self.fields, views)
 
     def numbers(self, name: str) -> wp.array:
-        """Return a view of a field as a Warp array of numbers. Vectors are (n, 3) and fractions (n, phases), and a
-        batch adds a first axis (batch, n, ...). Libraries with DLPack, such as PyTorch and JAX, use this array without
-        a copy."""
+        """Vectors are (n, 3) and fractions (n, phases), and a batch adds a first axis (batch, n, ...). Libraries with
+        DLPack, such as PyTorch and JAX, use the view without a copy."""
         field = self[name]
         shape = (len(field),) if self.batch is None else (self.batch, len(field) // self.batch)
         return components(field, (*shape, *getattr(field.dtype, "_shape_", ())))
 
     def narrow(self, dimension: int) -> dict[str, Any]:
-        """Return views of all fields by name, in the shapes of `numpy`: NumPy arrays on a CPU, and Warp arrays on a
-        GPU."""
+        """The views are NumPy arrays on a CPU and Warp arrays on a GPU, in the shapes of `numpy`."""
         if dimension not in self._narrow:
             on_host, vectors = self.positions.device.is_cpu, {f.name for f in self.fields if f.entry is Entry.VECTOR}
             whole = {name: self.numbers(name) for name in self.names}
@@ -231,8 +225,7 @@ class State(Arrays):
         return self._narrow[dimension]
 
     def set(self, values: Mapping[str, Any]) -> None:
-        """Write fields by name. Vectors are (n, d), numbers (n,) and fractions (n, phases), and a batch adds a first
-        axis (batch, n, ...)."""
+        """Vectors are (n, d), numbers (n,) and fractions (n, phases). A batch adds a first axis (batch, n, ...)."""
         for field in self.fields:
             if field.name in values:
                 given = np.asarray(values[field.name])
@@ -240,8 +233,7 @@ class State(Arrays):
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
     def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy every field, or the fields named in ``only``, to new arrays. Vectors are (n, dimension), numbers (n,)
-        and fractions (n, phases), and a batch adds a first axis (batch, n, ...)."""
+        """Copy every field, or the fields named in ``only``, to new arrays. The shapes are the shapes in `set`."""
         return {name: array.copy() for name, array in self.views(dimension, only).items()}
 
     def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
@@ -334,7 +326,7 @@ class Parameters(Arrays):
         return self.numbers(name)
 
     def _on_host(self, name: str) -> np.ndarray:
-        """Return a host array for the values of a parameter. On a CPU, the array shares memory with the parameter."""
+        """On a CPU, the array shares memory with the parameter."""
         if name not in self._tables:
             array = self[name]
             shape = (*array.shape, *getattr(array.dtype, "_shape_", ()))
@@ -342,8 +334,7 @@ class Parameters(Arrays):
         return self._tables[name]
 
     def set_row(self, row: int, values: Mapping[str, np.ndarray]) -> None:
-        """Write the values of parameters over time for one time step, as vectors (members, d) or numbers (members,).
-        Call `set` first."""
+        """Values are vectors (members, d) or numbers (members,) for one time step. Call `set` first."""
         for name, value in values.items():
             self._written[name][:, row] = value
             vectors = np.reshape(value, (len(value), -1))
@@ -354,8 +345,7 @@ class Parameters(Arrays):
 
 @dataclass(frozen=True)
 class Layout:
-    """The sizes of a solver's arrays, and their device. The scenes of a batch are concatenated, and a launch has one
-    thread for each particle of all scenes."""
+    """The scenes of a batch are concatenated, and a launch has one thread for each particle of all scenes."""
 
     particles: int
     phases: int
@@ -374,12 +364,10 @@ class Layout:
         return self.members * self.particles
 
     def sum_of(self, dtype: Any) -> TreeReduction:
-        """Make a function that sums numbers, vectors or matrices over the particles of each scene."""
         return sum_of(dtype, self.particles, self.device, self.members)
 
     def arrays(self, suffix: str = "", requires_grad: bool = False, **kinds: Any) -> dict[str, wp.array]:
-        """Make arrays of zeros with an element for each particle. ``kinds`` are Warp types by name, and ``suffix`` is
-        added to the names."""
+        """``kinds`` are Warp types by name, and ``suffix`` is added to the names."""
         sizes = {f"{name}{suffix}": (self.all_particles, kind) for name, kind in kinds.items()}
         return zeros(sizes, self.device, requires_grad)
 

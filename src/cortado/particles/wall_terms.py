@@ -109,8 +109,7 @@ class _Loop:
 
 @dataclass(frozen=True)
 class WallTerm:
-    """A term of the forces by walls. ``make(discretisation)`` returns the function that computes the work of
-    the term."""
+    """``make(discretisation)`` returns the function that computes the work of the term."""
 
     discretisation: Discretisation
     topic: str
@@ -121,8 +120,7 @@ class WallTerm:
 
     @property
     def kernels(self) -> Kernels:
-        """Return the kernels of the sum (``total``), of its tangent (``total_dot``), and of its adjoint (``bar``). The
-        kernel argument ``solid`` is the number of a solid or `ALL_WALLS`."""
+        """The kernel argument ``solid`` is the number of a solid or `ALL_WALLS`."""
         return _kernels(self)
 
     def solid_kernel(self) -> Any:
@@ -242,11 +240,8 @@ def share_kinds(precision: Precision) -> dict[str, Any]:
 def solid_kernel(
     discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
 ) -> Any:
-    """Make the kernel of one sum for `SolidShares.add`. ``topic`` names its Warp module.
-
-    ``make(discretisation)`` returns the function that computes the work of a wall term. The function may call only
-    functions that Warp can differentiate.
-    """
+    """``make(discretisation)`` returns the function that computes the work of a wall term. The function may call only
+    functions that Warp can differentiate."""
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))
     real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair
