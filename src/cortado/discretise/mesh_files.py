@@ -77,7 +77,7 @@ def triangles_in_file(path: str) -> tuple[Points, Numbers]:
 
 
 def read_triangles(path: str) -> tuple[Points, Numbers, float]:
-    """Also return the rounding step of float32 coordinates, or 0. Vertices (m, 3) are in the file's unit."""
+    """Return vertices (m, 3) in the file's unit, triangles (k, 3), and the rounding step of float32, or 0."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise InputError(f"{path!r} does not end in one of {', '.join(SUFFIXES)}: export the mesh as one of these.")
     if not (size := Path(path).stat().st_size):
@@ -130,7 +130,7 @@ class Thickness:
     points: Points
     """Points on the surface (n, 3) [m]."""
     lengths: Points
-    """Length of the straight line from each point through the solid (n,) [m], or infinity if it is not found."""
+    """Length of the straight line from each point through the solid (n,) [m], or infinity without an end."""
     is_sheet: np.ndarray
     """Mask (n,) of the points with a nearly parallel opposite surface."""
 

@@ -145,7 +145,7 @@ class Domain:
         return apart(ways, np.array(self.lengths)) if any(self.lengths) else ways
 
     def within(self, points: Points, lower: Points, upper: Points) -> tuple[Points, np.ndarray]:
-        """Also return which points have an image there. An infinite corner is the end of the periodic box."""
+        """Return images, and which points have an image between the corners. Infinite corners mean the periodic box."""
         start, lower, upper = self.ends(lower, upper)
         lengths = np.array(self.lengths)
         images = start + wrapped(points - start, lengths) if lengths.any() else points
@@ -197,7 +197,7 @@ WITHOUT_PERIODS = Domain((), ())
 
 @dataclass(frozen=True)
 class Room:
-    """A region without the solids in it. The solids repeat periodically."""
+    """A region without the solids inside. The solids repeat periodically."""
 
     region: Region
     solids: Sequence[Solid]

@@ -107,7 +107,7 @@ class Solid(ABC):
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Also return outward unit vectors. Return None if points must be found from a lattice around the solid."""
+        """Return surface points and outward unit vectors (n, d), or None if the points must be found from a lattice."""
         return None
 
     def outward(self, points: Points) -> Points:

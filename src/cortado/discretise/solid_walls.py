@@ -43,7 +43,7 @@ class SurfacePoints:
 
 
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
-    """``depth`` [m] is negative above the surface. In thin parts of the solid the points are in the middle."""
+    """A negative ``depth`` [m] means above the surface. In thin parts of the solid the points are in the middle."""
     fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
     points, tolerance = feet - depth * away, 1e-3 * depth
@@ -83,7 +83,7 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
-    """Also return outward unit vectors (n, d). Points that fail the test ``is_near`` may be left out."""
+    """Return surface points (n, d) [m] and outward unit vectors. Points that fail ``is_near`` may be left out."""
     found = solid.own_feet(fine)
     if found is not None:
         return found

@@ -285,7 +285,7 @@ def wall_weights(
     is_sheet[:sought] = crossed is not None
 
     def demands(places: Places) -> tuple["csr_array", Points]:
-        """Return the matrix (m, b) and the right-hand side (m,) of the fit. The unknowns are relative to flat walls."""
+        """Return the matrix (m, b) and the right-hand side (m,) of a fit of weights relative to flat walls."""
         place, wall, _ = pairs_within(places.points, walls, lattice.support, lower, room.periods)
         if crossed is not None:
             seen = crossed(places.points[place], walls[wall]) == is_sheet[wall]
