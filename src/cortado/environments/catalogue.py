@@ -1,4 +1,4 @@
-"""The control tasks. Carrying and pouring exist in 2-D and in 3-D."""
+"""The control tasks. `docs/environments.md` lists their actions, goals and rewards."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,14 +58,7 @@ class Vessels(Task):
 
 
 class Carry(Vessels):
-    """The task of carrying a cup of water to a place without spilling.
-
-    The actions are the cup's velocity along x and its angular velocity. The goal is the target position of the cup's
-    centre. The reward is minus the cup's distance from the goal [m], minus 10 times the fraction of water outside.
-
-    Task and reward follow TransportWater of SoftGym (Lin et al. 2020). In contrast to SoftGym, the fraction is a smooth
-    function of particle positions (`cortado.environments.terms.Share`), and the cup can lean.
-    """
+    """The task of carrying a cup of water to a place, after TransportWater of SoftGym (Lin et al. 2020)."""
 
     name = "Carry"
     horizon, repeats, lowest = 75, 6, -12.0
@@ -101,11 +94,7 @@ class Carry(Vessels):
 
 
 class CarryInSpace(Carry):
-    """The task of carrying a round cup of water along a line to a place without spilling.
-
-    Actions, goal and reward are the same as for `Carry`. The cup is lower, and leans about an axis perpendicular to its
-    path.
-    """
+    """The task of carrying a lower, round cup of water, which leans about an axis across its path."""
 
     name = "CarryInSpace"
     dimension, finer = 3, 2
@@ -115,15 +104,8 @@ class CarryInSpace(Carry):
 
 
 class Latte(Task):
-    """The task of pouring milk from a moving nozzle into coffee. The milk should land as if the nozzle had followed a
-    hidden path.
-
-    The actions are target positions of the nozzle along x. The targets of milk particles are their positions in a run
-    along the hidden path. The reward is minus the mean squared distance of the poured milk from its targets, divided by
-    the squared radius of the cup.
-
-    The task follows LatteArt of FluidLab (Xian et al. 2023). Its reward differs by a factor and a constant.
-    """
+    """The task of pouring milk into coffee like a nozzle on a hidden path, after LatteArt of FluidLab (Xian et al.
+    2023). The goals of milk particles are their positions in a run along the hidden path."""
 
     name = "Latte"
     horizon, repeats, lowest = 32, 6, -4.0
@@ -178,14 +160,7 @@ def _hidden(task: Latte, device: str, precision: str) -> tuple[NDArray, NDArray]
 
 
 class Pour(Vessels):
-    """The task of pouring syrup from a jug into a glass by moving and turning the jug.
-
-    The actions are the jug's velocity along x and its angular velocity, counterclockwise. The reward is the fraction of
-    the fluid in the glass.
-
-    Task and reward follow PourWater of SoftGym (Lin et al. 2020). In contrast to SoftGym, the fraction is a smooth
-    function of particle positions (`cortado.environments.terms.Share`), and the jug stays at its height.
-    """
+    """The task of pouring syrup from a jug into a glass, after PourWater of SoftGym (Lin et al. 2020)."""
 
     name = "Pour"
     horizon, repeats, lowest = 75, 10, 0.0
@@ -221,11 +196,7 @@ class Pour(Vessels):
 
 
 class PourInSpace(Pour):
-    """The task of pouring a given fraction of syrup from a round jug into a round glass.
-
-    The actions are the same as for `Pour`. The goal is the fraction of the syrup to pour. The reward is minus the
-    absolute difference between the poured fraction and the goal.
-    """
+    """The task of pouring a given fraction of syrup from a round jug into a round glass."""
 
     name = "PourInSpace"
     dimension, finer = 3, 2
@@ -240,12 +211,7 @@ class PourInSpace(Pour):
 
 
 class Raft(Task):
-    """The task of moving a raft to a place with waves from a paddle, while the raft stays level.
-
-    The actions are target positions of the paddle along x. The goal is the target position of the raft's centre. The
-    reward is -(x - x*)^2 / l^2 - 2 (1 - cos angle), with the raft's position x, the goal x*, the raft's length l and
-    its angle.
-    """
+    """The task of moving a raft to a place with waves from a paddle, while the raft stays level."""
 
     name = "Raft"
     horizon, repeats, lowest = 40, 8, -15.0
@@ -276,12 +242,7 @@ class Raft(Task):
 
 
 class Splash(Task):
-    """The task of shaking a box of water after a dam break, so that the water takes the shape of the letter L.
-
-    The actions are the acceleration of the box along x and y, which acts on the water as a change of gravity. The goal
-    is the x coordinate of the left side of the letter's vertical bar. The reward is the fraction of the water inside
-    the letter, as a smooth function of particle positions (`cortado.environments.terms.Share`).
-    """
+    """The task of shaking a box of water after a dam break, so that the water takes the shape of the letter L."""
 
     half = 0.3
     name = "Splash"
@@ -322,14 +283,7 @@ class Letter:
 
 
 class Stir(Task):
-    """The task of stirring a cup of coffee until milk from one corner is spread everywhere.
-
-    The actions are target positions of the spoon, which is a disc in the plane. The distance of two particles is
-    measured as |dx| + |dy|. The reward is the mean distance of pairs of milk particles, divided by the initial mean
-    distance of all pairs of particles, minus 1.
-
-    The task follows Mixing of FluidLab (Xian et al. 2023). Its reward differs by a factor.
-    """
+    """The task of stirring milk into a cup of coffee, after Mixing of FluidLab (Xian et al. 2023)."""
 
     name = "Stir"
     horizon, repeats, lowest = 50, 16, -1.0

@@ -1,11 +1,7 @@
 """Gradient estimators for `Problem.value_and_gradient`. Each class states its formula, bias and cost.
 
-`Exact` computes the derivative of the discrete step by hand-written adjoints, and `Tape` by Warp's automatic
-differentiation. Beyond the predictability horizon neighbouring trajectories diverge, and the exact derivative is of
-little use. `AdjointViscosity` damps the adjoint instead.
-
-`EnsembleMean` averages gradients over an ensemble. `Guided` also corrects the size of the gradients by differences of
-the loss. `RandomizedSmoothing` needs only forward runs, and is the reference for all estimators.
+`Exact` and `Tape` suit short runs. For long runs, `AdjointViscosity` damps the adjoint, `EnsembleMean` averages
+gradients, and `Guided` also corrects their size. `RandomizedSmoothing` is the reference for all estimators.
 """
 
 from cortado.arrays import require_function, require_methods

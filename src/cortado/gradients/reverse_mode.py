@@ -220,13 +220,8 @@ class AdjointViscosity(AdjointEstimator):
     sum. The weights are symmetric and sum to at most 1, and the strength is at most 0.6. The sum of a_i is therefore
     conserved, and the norm of a does not grow.
 
-    Why: an adjoint grows exponentially at the scale of particles, while the response to a parameter has the scale of
-    the fluid. The viscosity damps short waves of the adjoint much more than long waves. The growth rate of the adjoint
-    follows the strain rate of the forward flow. Therefore one coefficient suits all flows, and calm flow is not damped.
-
-    Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. Without
-    this limit, the adjoints of a few particles may grow faster than the viscosity spreads them. In a flow without
-    strain the adjoints are not limited.
+    Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. In a flow
+    without strain the adjoints are not limited. `docs/gradients.md` explains both.
 
     Long waves are slightly damped too, which affects gradients with respect to early steps most. ``order=2``
     extrapolates the gradients g(C) and g(2 C) of two coefficients C and 2 C to zero viscosity (Richardson): the result
