@@ -137,10 +137,8 @@ class EngineMissingError(CortadoError, ImportError):
     """An error if the reference engine is not installed."""
 
     def __str__(self) -> str:
-        compiler = "which needs a C++17 compiler (g++, for all precisions)"
-        return (
-            f"The reference engine is not installed: in a clone of the repository pip install ./reference, {compiler}."
-        )
+        said = "The reference engine is not installed: in a clone of the repository pip install ./reference"
+        return f"{said}, which needs a C++17 compiler (g++, for all precisions)."
 
 
 class ExtraMissingError(InputError, ImportError):

@@ -285,8 +285,7 @@ def _connected(module: Any, address: str) -> Any:
     from distributed.comm import connect
 
     async def meet() -> None:
-        comm = await connect(address, timeout=REACHED)
-        await comm.close()
+        await (await connect(address, timeout=REACHED)).close()
 
     # In a thread, as notebooks have an event loop in theirs.
     with ThreadPoolExecutor(1) as thread:

@@ -23,7 +23,7 @@ from cortado.rollout.device_states import without_lost
 from cortado.rollout.parameter_space import ParameterSpace
 from cortado.rollout.rollout import OBSERVED, BackwardStep, Observer, Residual, Rollout
 from cortado.rollout.run_checks import one_for_each
-from cortado.rollout.stepper import BackwardSteps
+from cortado.rollout.stepper import backward_step
 from cortado.runs.probes import warn_of_places
 from cortado.runs.quantity_values import Moment, add_to_row, row_of
 from cortado.runs.recording import QuantityReader
@@ -52,7 +52,6 @@ class ProblemForwardPass(Staying):
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]
     _space: ParameterSpace
-    _derivatives: BackwardSteps
 
     @property
     def turn(self) -> Turn:
@@ -65,15 +64,15 @@ class ProblemForwardPass(Staying):
         ``observe`` is called with the number and the adjoint of every state, from the last to the first. Raises
         `InputError` if the estimator's settings can change, or if it may mix scenes of a batch.
         """
-        return self._backward(self._derivatives.of(estimator), observe)[1]
+        return self._backward(backward_step(self._residual.rollout, estimator), observe)[1]
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
         """Return the gradient, and the derivatives with respect to the first state, both computed by an ``estimator``.
         The derivatives with respect to the state are a dictionary by field name, with ``time``."""
-        derivative = self._derivatives.of(estimator)
-        first, gradient = self._backward(derivative)
         rollout = self._residual.rollout
+        derivative = backward_step(rollout, estimator)
+        first, gradient = self._backward(derivative)
         initial_state = self._space.state_adjoint(rollout, self._values, first, derivative.parameters())
         return gradient, without_lost(dict.fromkeys(rollout.lost, np.nan), initial_state)
 
@@ -153,7 +152,6 @@ class Problem:
         warn_of_places(simulation, self._losses.sensors)
         self._space = ParameterSpace(simulation, self.steps)
         self._rollout = Rollout(simulation.solver, self.steps, self.memory_budget)
-        self._derivatives = BackwardSteps(self._rollout)
         self._batches: dict[int, Problem] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -236,7 +234,7 @@ class Problem:
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
         loss, found = self._losses.total_and_adjoints(ends, self._going)
         bars = {step: bar.through_quantities(ends[step]) for step, bar in found.items()}
-        return ProblemForwardPass(loss, residual, values, bars, self._space, self._derivatives)
+        return ProblemForwardPass(loss, residual, values, bars, self._space)
 
     @in_turn
     def tangent(self, parameters: Values, directions: Values) -> Any:

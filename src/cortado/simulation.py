@@ -224,8 +224,7 @@ class Simulation(Stepping):
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
-        parts = frame_parts(expected, numbers, self.precision.bytes)
-        require(parts, "take a larger record_every or fewer steps")
+        require(frame_parts(expected, numbers, self.precision.bytes), "take a larger record_every or fewer steps")
         watch = Watch(self, rollout, record, sensors)
         steps, frames = list[int](), Table(expected)
         changing = [field.name for field in self.initial.fields if not field.is_constant]

@@ -45,8 +45,7 @@ class Twin:
         each = zip(task.actuators, begun, strict=True)
         self.coordinates = {one.parameter: one.over(count, m, task.time_step, now) for one, now in each}
         """Affine map from the actions of each actuator to its parameter, by parameter name."""
-        goal = start.goal[None]
-        loss = Frames({k * m: MinusReward(scenes.reward, goal, done + k) for k in range(1, count + 1)})
+        loss = Frames({k * m: MinusReward(scenes.reward, start.goal[None], done + k) for k in range(1, count + 1)})
         self.problem = Problem(scenes.single, count * m, loss, state=restart)
         """The loss as a function of the scene's parameters."""
         fixed: Any = FixedParameters(self.problem, self._start) if self._start else self.problem

@@ -161,8 +161,7 @@ class SideBySide:
             for name in whole.names:
                 size = len(whole[name]) // len(state.scenes)
                 arrays[name] = whole[name][first * size : last * size]
-            part = State(whole.fields, arrays, last - first)
-            found[k] = self.steppers[k].follow(DeviceState(part, scenes), own)
+            found[k] = self.steppers[k].follow(DeviceState(State(whole.fields, arrays, last - first), scenes), own)
 
         in_parallel(take, range(len(self.steppers)), min(usable_cores(), MOST_CORES, len(self.steppers)))
         parts, like = [found[k] for k in range(len(self.steppers))], state.arrays

@@ -131,8 +131,7 @@ class Sampler:
 
 
 def _moved(values: Arrays, change: np.ndarray) -> Arrays:
-    ends = np.cumsum([value.size for value in values.values()])
-    parts = np.split(change, ends[:-1])
+    parts = np.split(change, np.cumsum([value.size for value in values.values()])[:-1])
     return {name: value + part.reshape(value.shape) for (name, value), part in zip(values.items(), parts, strict=True)}
 
 
@@ -368,8 +367,7 @@ class Guided(Ensemble):
         runs = self.evaluated(problem, points(), None)
         kept = remaining(runs, self.differences, "samples of the differences")
         pairs = np.array([one.loss for one in runs]).reshape(self.differences, len(parts), 2)[kept]
-        slopes = (pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach))
-        sizes, size_errors = mean_and_error(slopes)
+        sizes, size_errors = mean_and_error((pairs[..., 0] - pairs[..., 1]) / (2.0 * np.array(reach)))
         along, across = (np.reshape(rows, (-1, len(ensemble.spreads))) for rows in (parts, turns))
         errors = np.array([size_errors @ np.abs(along), np.abs(sizes) @ across])
         gradient, error = (ensemble.named(one / ensemble.spreads) for one in (sizes @ along, np.hypot(*errors)))

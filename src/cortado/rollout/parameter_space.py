@@ -161,10 +161,9 @@ class ParameterSpace:
             self._warn(dry_sentence(simulation.scene, rollout))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
         if len(substeps) > 1:
-            raise InputError(
-                f"The scenes of the batch take {' and '.join(map(str, sorted(substeps)))} explicit steps of diffusion "
-                f"in a time step, but must all take the same number: make {', '.join(DIFFUSION)} differ less."
-            )
+            found = f"{' and '.join(map(str, sorted(substeps)))} explicit steps of diffusion in a time step"
+            wanted = f"must all take the same number: make {', '.join(DIFFUSION)} differ less"
+            raise InputError(f"The scenes of the batch take {found}, but {wanted}.")
         several = len(simulation.scene.phase) > 1
         rollout.substeps = max(*substeps, 1) if "mobility" in varied and several else max(substeps)
         each = self._keep(rollout, values, varied, members)
@@ -290,10 +289,8 @@ class ParameterSpace:
         array = checked_value(name, value, [*own, *self._batched(own)], what, self._known)
         if len(own) == 2 and array.shape == own[1] and self._batch == self._steps > 1:
             rows, *rest = own[1]
-            raise InputError(
-                f"{what} {name} has shape {array.shape}, which may be a row for each step or for each scene of the "
-                f"batch, but must be {(1, rows, *rest)} or {(rows, 1, *rest)}."
-            )
+            found = f"has shape {array.shape}, which may be a row for each step or for each scene of the batch"
+            raise InputError(f"{what} {name} {found}, but must be {(1, rows, *rest)} or {(rows, 1, *rest)}.")
         return array
 
     def _batched(self, own: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
@@ -332,8 +329,7 @@ class ParameterSpace:
         except InputError as error:
             place = "" if self._batch is None else f"In scene {number} of the batch, "
             raise OutOfRangeError(f"{place}{error}") from error
-        upright = self._one.upright(values)
-        unstable = unstable_sentence(upright, simulation.scene, self._told) if values else None
+        unstable = unstable_sentence(self._one.upright(values), simulation.scene, self._told) if values else None
         for sentence in filter(None, (crowded, unstable)):
             warn(sentence)
 
@@ -358,10 +354,8 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
         shortest = float(sizes.min(initial=np.inf))
         return counted_steps(time, time / shortest * (1.0 - SAME)) if 0.0 < shortest < np.inf else 1
     if simulation.batch is not None:
-        raise InputError(
-            "time is given, but must be left out of a batch with chosen time steps, as its scenes reach a time in "
-            "different steps: give steps."
-        )
+        said = "time is given, but must be left out of a batch with chosen time steps"
+        raise InputError(f"{said}, as its scenes reach a time in different steps: give steps.")
     # with 0 steps, because rows for steps have no meaning with an unknown number of steps
     own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))
     return ROOM * expected_steps(simulation, time, own)

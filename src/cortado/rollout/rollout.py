@@ -7,7 +7,7 @@ lists were too short.
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import count
-from typing import Protocol
+from typing import Any, Protocol
 from weakref import WeakSet
 
 import numpy as np
@@ -115,6 +115,7 @@ class Rollout(Staying):
         self.evaluation = 0
         """Number of the evaluation. Every new first state or parameter begins an evaluation."""
         self._evaluations = count(1)
+        self.derivatives: dict[Any, BackwardStep] = {}
         self.pending: WeakSet[Residual] = WeakSet()
         self.aside: list[tuple[State, StepLog]] = []
         self._kept = self._run = -1

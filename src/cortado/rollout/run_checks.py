@@ -51,25 +51,20 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
         room = np.prod(np.ptp(positions[:free], axis=0) + spacing) if free else np.inf
         if room < 0.5 * (needed := free * spacing**scene.dimension):
             unit = "m2" if scene.dimension == 2 else "m3"
-            raise InputError(
-                f"parameter initial_positions has all particles within {room:.3g} {unit}, but must leave them about "
-                f"the {needed:.3g} {unit} that their fluid fills."
-            )
+            found = f"parameter initial_positions has all particles within {room:.3g} {unit}"
+            raise InputError(f"{found}, but must leave them about the {needed:.3g} {unit} that their fluid fills.")
     for emitter in scene.emitter:
         name = path_name(emitter.name)
         if scene.solver.chooses and np.ndim(values.get(name, 0.0)) == 2:
-            raise InputError(
-                f"parameter {name} has a row for each step, but must be one place where time steps are chosen: move "
-                "the emitter by its table path, whose times do not depend on the steps."
-            )
+            wanted = "one place where time steps are chosen: move the emitter by its table path"
+            why = "whose times do not depend on the steps"
+            raise InputError(f"parameter {name} has a row for each step, but must be {wanted}, {why}.")
         if name in values:
             path, opening = np.atleast_2d(values[name]), emitter.opening(spacing) - emitter.outlet
             places = (path[:, None] + opening).reshape(-1, scene.dimension)
             for step in outside(scene.room, places, spacing)[:1] // len(opening):
-                raise InputError(
-                    f"parameter {name} is at {point_in_words(path[step])} m in step {step + 1}, but must be where all "
-                    "of the opening is inside the container."
-                )
+                found = f"parameter {name} is at {point_in_words(path[step])} m in step {step + 1}"
+                raise InputError(f"{found}, but must be where all of the opening is inside the container.")
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
@@ -284,10 +279,9 @@ def _check_origin(found: Origin, wanted: Origin) -> None:
         if not (is_same or isinstance(one, str) or isinstance(other, str)):
             is_same = np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=SAME, atol=0.0)
         if not is_same:
-            raise InputError(
-                f"state is of a run with {words.format(_listed(one))}, but must be of one with "
-                f"{words.format(_listed(other))}, as this simulation has{ADVICE.get(name, '')}."
-            )
+            own, needed = words.format(_listed(one)), words.format(_listed(other))
+            why = f"as this simulation has{ADVICE.get(name, '')}"
+            raise InputError(f"state is of a run with {own}, but must be of one with {needed}, {why}.")
 
 
 WORDS = {
@@ -331,10 +325,8 @@ def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
     found, first = (nearest(x) / spacing for x in (positions, simulation.positions[: len(positions)]))
     usual, least = float(np.median(found)), float(np.quantile(found, 0.1))
     if usual < 0.7 or least > 1.4 * max(float(np.quantile(first, 0.1)), 1.0):
-        raise InputError(
-            f"state positions are usually {usual:.2g} spacings of {spacing:g} m from the nearest other particle, but "
-            "must be about one: the state is of a run with another spacing."
-        )
+        found = f"state positions are usually {usual:.2g} spacings of {spacing:g} m from the nearest other particle"
+        raise InputError(f"{found}, but must be about one: the state is of a run with another spacing.")
 
 
 TORN = 0.015

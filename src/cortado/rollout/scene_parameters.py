@@ -89,8 +89,7 @@ class SceneParameters:
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
         """Return the times (steps,) [s] for the values of a scheduled parameter."""
-        time_step = float(values.get("time_step", self.values["time_step"]))
-        return (clock or Clock()).times(self._moments(name), time_step)
+        return (clock or Clock()).times(self._moments(name), float(values.get("time_step", self.values["time_step"])))
 
     def _moments(self, name: str) -> NDArray:
         """Return the times (steps,) for the values of a scheduled parameter, in units of time steps."""
@@ -143,10 +142,9 @@ class SceneParameters:
             found = reference_density(fractions, density)
         bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
         if bad.size:
-            raise InputError(
-                f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}, but must be such that its "
-                "volume, the sum of the fractions over the rest densities of the phases, is greater than 0."
-            )
+            said = f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}"
+            volume = "its volume, the sum of the fractions over the rest densities of the phases"
+            raise InputError(f"{said}, but must be such that {volume}, is greater than 0.")
         return {**fields, DENSITY: found}
 
     def direction(
@@ -156,15 +154,12 @@ class SceneParameters:
         for view, replaced in self._known.views.items():
             for name, other in ((view, replaced), (replaced, view)):
                 if name in along and other in values:
-                    raise InputError(
-                        f"direction {name} is given, but must be left out, as {other} is given in its place."
-                    )
+                    why = f"as {other} is given in its place"
+                    raise InputError(f"direction {name} is given, but must be left out, {why}.")
         if "tilt" in along:
             if "tilt" not in values and self._simulation.scene.schedule.leads_gravity:
-                raise InputError(
-                    "direction tilt is given, but must be left out, as the scene's schedule says where gravity points: "
-                    "give the tilt among the parameters, too."
-                )
+                why = "as the scene's schedule says where gravity points: give the tilt among the parameters, too"
+                raise InputError(f"direction tilt is given, but must be left out, {why}.")
             angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}
         rates = self._scheduled_rates(values, clock) if "time_step" in along else {}

@@ -39,10 +39,8 @@ def greatest_step(scene: SceneTables, values: Arrays) -> float:
     """Return the longest possible time step [s] for any gravity."""
     found = min(chosen_limits(scene, values).values())
     if not np.isfinite(found):
-        raise InputError(
-            "solver.greatest_time_step is missing, but must be given, as with these parameters nothing else limits "
-            "the time step of fluid at rest."
-        )
+        why = "as with these parameters nothing else limits the time step of fluid at rest"
+        raise InputError(f"solver.greatest_time_step is missing, but must be given, {why}.")
     return found
 
 
@@ -54,10 +52,10 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
         bounds = np.minimum(bounds, np.minimum.reduce(list(limits)))
     strongest = stability_limits(scene, values)  # at the strongest scheduled gravity
     if (shortest := min(float(bounds.min()), strongest["gravity"], strongest["depth"])) < least:
-        raise InputError(
-            f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision: "
-            "increase solver.greatest_time_step, or whatever else limits the time step."
+        said = (
+            f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision"
         )
+        raise InputError(f"{said}: increase solver.greatest_time_step, or whatever else limits the time step.")
     return bounds
 
 

@@ -55,27 +55,20 @@ def require_hash(estimator: Any) -> Any:
     return estimator
 
 
-class BackwardSteps:
-    def __init__(self, rollout: Rollout):
-        self._rollout, self._made = rollout, dict[ReverseEstimator | None, BackwardStep]()
-
-    def of(self, estimator: ReverseEstimator | None) -> BackwardStep:
-        """Return the backward step of an estimator, by default of the exact estimator."""
-        solver = self._rollout.solver
-        if estimator is not None:
-            wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
-            require_methods("gradient", estimator, ("derivative",), wanted)
-            if solver.layout.batch is not None and not estimator.batches:
-                raise InputError(
-                    f"{type(estimator).__name__} is given a batch, but has no `batches = True`, which says that it "
-                    "treats each scene by itself."
-                )
-        if require_hash(estimator) not in self._made:
-            parts = solver.gradient_memory(self._rollout.log)
-            require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
-            make = AdjointStep if estimator is None else estimator.derivative
-            self._made[estimator] = make(self._rollout)
-        return self._made[estimator]
+def backward_step(rollout: Rollout, estimator: ReverseEstimator | None) -> BackwardStep:
+    """Return the backward step of an estimator, by default of the exact one. The rollout caches backward steps."""
+    solver = rollout.solver
+    if estimator is not None:
+        wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
+        require_methods("gradient", estimator, ("derivative",), wanted)
+        if solver.layout.batch is not None and not estimator.batches:
+            found = f"{type(estimator).__name__} is given a batch, but has no `batches = True`"
+            raise InputError(f"{found}, which says that it treats each scene by itself.")
+    if require_hash(estimator) not in rollout.derivatives:
+        parts = solver.gradient_memory(rollout.log)
+        require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
+        rollout.derivatives[estimator] = AdjointStep(rollout) if estimator is None else estimator.derivative(rollout)
+    return rollout.derivatives[estimator]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,9 +82,8 @@ class StepResidual(Staying):
     instead = "but the state before its steps and the parameters can, from which they are taken again"
 
     def __repr__(self) -> str:
-        return (
-            f"StepResidual({counted(self.evaluation.rollout.steps, 'step')}, parameters {sized(self.values) or 'none'})"
-        )
+        steps = counted(self.evaluation.rollout.steps, "step")
+        return f"StepResidual({steps}, parameters {sized(self.values) or 'none'})"
 
 
 class AdjointGrowth:
@@ -146,7 +138,6 @@ class Stepper:
         self._simulation, self._space = simulation, ParameterSpace(simulation, steps)
         self._rows = DeviceRows(simulation, self._space)
         self.rollout = Rollout(simulation.solver, steps)
-        self._derivatives = BackwardSteps(self.rollout)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._simulation, self.rollout.steps)
@@ -227,7 +218,7 @@ class Stepper:
         `InputError` for unknown fields and for wrong shapes.
         """
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
-        adjoint = self._derivatives.of(gradient)
+        adjoint = backward_step(self.rollout, gradient)
         times = place.write("state_bar", state_bar, self._bar)
         values = residual.values
         residual.evaluation.bring_back()
@@ -260,16 +251,13 @@ class Stepper:
         values = residual.values
         residual.evaluation.bring_back()
         if "mobility" in along and not rollout.substeps:
-            raise InputError(
-                "direction mobility is given, but must be named where the step is taken, as nothing diffuses where the "
-                'mobility is 0: step(..., along=["mobility"]).'
-            )
+            why = 'as nothing diffuses where the mobility is 0: step(..., along=["mobility"])'
+            raise InputError(f"direction mobility is given, but must be named where the step is taken, {why}.")
         space.set_direction(rollout, values, along, dot, parameters_dot, np.broadcast_to(times, len(rollout.clocks)))
         self._rows.write(rows, parameters_dot)
         lost = of_lost(rollout, dot, times, parameters_dot)
         rollout.tangent(dot, parameters_dot, lambda number, state: None)
-        sizes = along.get("time_step", np.zeros(()))
-        later = times + rollout.steps * np.broadcast_to(sizes, times.shape)
+        later = times + rollout.steps * np.broadcast_to(along.get("time_step", np.zeros(())), times.shape)
         return {**place.read(dot, lost), **without_lost(lost, {STATE_TIME: later})}
 
     def _place_of(self, residual: StepResidual) -> HostStates:
