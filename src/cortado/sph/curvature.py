@@ -44,8 +44,7 @@ from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 
 DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
-"""Lengths that determine the depth of the force [spacings]: depth of the computed curvature, excess of the force on
-curved surfaces, and depth where the force acts."""
+"""Lengths that determine the depth of the force [spacings]; see the docstring of this module."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +81,9 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
 
 FAINT, CLEAR = 0.03, 0.1
 SINGULAR = {2: 1e-3, 3: 1e-4}
-"""Regularisation of a determinant, for each dimension. The curvature is then 0 if neighbours lie on a line."""
+"""Number added to a determinant, for each dimension. The curvature is then 0 if neighbours lie on a line."""
 LONE = 1e-6
-"""Regularisation of the sum of weights. The mean curvature is then 0 without neighbours in the surface."""
+"""Number added to the sum of weights. The mean curvature is then 0 without neighbours in the surface."""
 HOLLOW = 0.25
 """Curvature of a bubble times the depth of the force. Above this value the curvature is smoothly limited."""
 
@@ -134,8 +133,7 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 
 @cache
 def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of the sums over the fluid, with derivatives. A symmetric matrix is stored as its
-    diagonal and its components yz, xz and xy."""
+    """A symmetric matrix is stored as its diagonal and its components yz, xz and xy."""
     precision = discretisation.precision
     real, vector = precision.real, precision.vector
     neighbourhood, matrix = neighbourhood_type(precision), precision.matrix
@@ -230,7 +228,6 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return the Warp types of the particles' arrays by name."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
     return {**vectors, **matrices, **numbers}
@@ -238,7 +235,6 @@ def entries(precision: Precision) -> dict[str, Any]:
 
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels ``colour``, ``normal``, ``bend`` and ``mean`` in 2 or 3 dimensions, with derivatives."""
     precision, (real, vector, _) = discretisation.precision, discretisation.types
     matrix, sums, typed = precision.matrix, curvature_sums(discretisation), types_of(discretisation)
     moments = moment_functions(precision, dimension)

@@ -29,7 +29,6 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 @cache
 def density_sums(discretisation: Discretisation) -> Kernels:
-    """Make the Warp functions of the sum of the kernel over neighbours, with derivatives."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     weight, slope, gradient = pair.weight, pair.slope, pair.gradient
@@ -67,7 +66,6 @@ def _density_work(d: Discretisation) -> Any:
 
 @cache
 def density_kernels(discretisation: Discretisation, topic: str = "density") -> Kernels:
-    """Make the kernels of the number density. ``topic`` is part of the names of Warp modules."""
     real, neighbourhood = discretisation.precision.real, neighbourhood_type(discretisation.precision)
     module, tangent_module, adjoint_module = discretisation.modules(topic)
     sums = density_sums(discretisation)
@@ -122,7 +120,6 @@ class DensityAdjoint:
 
 @cache
 def wall_slope_sums(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of the sum of kernel gradients over walls, with derivatives."""
     _, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     gradient, hessian_product = pair.gradient, pair.hessian_product
@@ -160,8 +157,7 @@ class WallAction(Protocol):
     number of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return the action of walls on sorted particles, (n,) vectors. The action of a force consists of accelerations
-        [m / s2]."""
+        """Return vectors (n,) for sorted particles. The action of a force consists of accelerations [m/s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
         """Return the tangents of the action (n,). Forward mode of the step must be complete."""
@@ -172,7 +168,7 @@ class WallAction(Protocol):
 
 
 class WallSums:
-    """A `WallAction` that sums a `WallTerm`. Its arrays are from the last step."""
+    """A `WallAction` that sums a `WallTerm`. Each call of a method overwrites the array of the previous call."""
 
     def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
         self.term, self._layout, self._constants = term, layout, constants

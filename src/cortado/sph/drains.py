@@ -41,7 +41,7 @@ from cortado.sph.emitter import Nozzle, nozzle_type, remaining_function
 from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepContext, Tangents
 
 MEMORY = 0.98
-"""Subtracted fraction of the velocity change by the pressure of the previous step."""
+"""Fraction of the velocity change by pressure in the previous step that a sink subtracts [-]."""
 BOX, PLANE, BALL = 0, 1, 2
 MOST = 0.25
 DRAINED = StateField("drained", "", Entry.NUMBER)
@@ -75,8 +75,6 @@ class Pull:
 
 @dataclass(frozen=True)
 class Drained:
-    """The drains of a scene, and resting positions for removed particles."""
-
     mouths: Sequence[Mouth]
     pulls: Mapping[str, Pull]
     places: Points
@@ -88,8 +86,6 @@ class Drained:
 
 @cache
 def mouth_type(precision: Precision) -> Any:
-    """Return the Warp struct of a drain. ``lower`` and ``upper`` are corners of a box relative to its middle [m];
-    ``lower`` may also be the direction of a plane. ``period`` are the lengths of the periodic box [m]."""
     real, vector = precision.real, precision.vector
     ends, periods = {"lower": vector, "upper": vector}, {"period": vector, "frequency": vector}
     return struct_of("MouthOf", precision, shape=wp.int32, number=real, **ends, radius=real, **periods)
@@ -109,7 +105,6 @@ def nearest_function(precision: Precision, module: Any) -> Any:
 
 @cache
 def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]:
-    """Make the kernels that mark waiting particles, mark removed particles, and move removed particles."""
     real, vector, mouth_of = precision.real, precision.vector, mouth_type(precision)
     module = kernel_module(f"drains_{'taped_' * taped}{precision.name}", taped)
     derivatives = kernel_module(f"drains_derivative_{precision.name}")
@@ -165,7 +160,6 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
 
 @cache
 def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, Kernels]:
-    """Make the kernels of sinks: counts of removed and of missing particles, the acceleration, and the flow rate."""
     real, vector = precision.real, precision.vector
     modules = [kernel_module(f"sinks_{'taped_' * taped}{precision.name}", taped)]
     modules += [kernel_module(f"sinks_derivative_{precision.name}")] * 2
@@ -204,7 +198,6 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
     @wp.kernel(module=modules[0], enable_backward=False)
     @of_scene.arrays
     def fall_behind(step, table: rows, time_step, taken_sum, cell: real, holds: real, behind, gain):
-        """Update ``behind``, the number of particles that the sink should have removed but has not."""
         m = wp.tid()
         held = wp.float64(holds)
         gain[m] = real(wp.float64(1.0) + wp.round(behind[m]) / held)
@@ -243,8 +236,6 @@ class DrainsAdjoint(PartAdjoint):
 
 
 class Drains(Part):
-    """The part of a step that removes particles, and the force of sinks, which is the last force of a step."""
-
     batches = is_last = True
     derivatives = DrainsTangent, DrainsAdjoint
 
@@ -257,8 +248,7 @@ class Drains(Part):
         counts = (StateField(count_name(one.name), "", Entry.DOUBLE, Axis.SCALAR) for one in of.mouths)
         self.fields = (DRAINED, *map(behind, of.pulls), *counts)
         self.taken = layout.arrays(taken=real, fresh=real, waits=real)
-        """Three arrays (n,): number of the drain that removed a particle, 1 for particles of the last drain, and 1 for
-        particles that wait in an emitter."""
+        """Arrays (n,): number of a particle's drain; 1 if removed by the last drain; 1 if waiting in an emitter."""
         self.places = to_device(of.places, precision, device)
         self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
         self._never = layout.arrays(serial=wp.float64)["serial"]

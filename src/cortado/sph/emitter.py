@@ -33,7 +33,6 @@ from cortado.sph.parts import Part, PartAdjoint, PartTangent, StepContext, Tange
 
 @cache
 def nozzle_type(precision: Precision) -> Any:
-    """Return the Warp struct of an emitter: distances ``upstream``, ``offsets`` from the axis, and opening ``area``."""
     real, vector = precision.real, precision.vector
     particles = dict.fromkeys(("first", "count", "layer"), wp.int32)
     arrays = {"upstream": wp.array(dtype=real), "offsets": wp.array(dtype=vector)}
@@ -43,7 +42,7 @@ def nozzle_type(precision: Precision) -> Any:
 
 @cache
 def remaining_function(precision: Precision) -> Any:
-    """Make the Warp function of a particle's distance upstream of the opening [m], at most 0 for free particles."""
+    """A particle's distance upstream of the opening [m] is at most 0 if the particle is free."""
     real, nozzle_of = precision.real, nozzle_type(precision)
 
     @wp.func
@@ -60,11 +59,8 @@ def remaining_function(precision: Precision) -> Any:
 
 @cache
 def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels]:
-    """Make the kernels of the motion of the column and of its particles.
-
-    ``outlet`` (members,) is the position of the opening [m], and ``drift`` the velocity of waiting particles [m/s].
-    ``emitted`` is the length of the emitted column [m]. ``path`` and ``flow`` have a value for each step.
-    """
+    """``outlet`` (members,) is the position of the opening [m], and ``drift`` the velocity of waiting particles [m/s].
+    ``emitted`` is the length of the emitted column [m]."""
     real, vector, nozzle_of = precision.real, precision.vector, nozzle_type(precision)
     module, derivatives = (integration_module(precision, *one, topic="emitter") for one in ((True, taped), (False,)))
     numbers, remaining = ["nozzle", "particles"], remaining_function(precision)
@@ -153,7 +149,6 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
 
 @cache
 def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
-    """Make the kernels that mark removed particles and give them places in the queue of an emitter."""
     real, nozzle_of, remaining = precision.real, nozzle_type(precision), remaining_function(precision)
     module = integration_module(precision, True, taped, "emitter")
     numbers = {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "i member particles"}
@@ -184,8 +179,6 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Nozzle:
-    """The opening of an emitter and its waiting particles."""
-
     name: str
     first: int
     sample: EmitterSample
@@ -237,7 +230,6 @@ class EmitterAdjoint(PartAdjoint):
         self._sums = [part.layout.sum_of(part.layout.precision.vector) for _ in range(2)]
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
-        """Return the adjoint of free particles. Add the adjoint of waiting particles to ``bar``."""
         emitter, free, prescribed = self.part, self._free, self._prescribed
         parts = {"x_free_bar": free.positions, "v_free_bar": free.velocities}
         parts |= {"x_prescribed_bar": prescribed.positions, "v_prescribed_bar": prescribed.velocities}
@@ -253,8 +245,6 @@ class EmitterAdjoint(PartAdjoint):
 
 
 class Emitter(Part):
-    """The part of a step that prescribes the motion of waiting particles in an emitter."""
-
     derivatives = EmitterTangent, EmitterAdjoint
 
     def __init__(self, nozzle: Nozzle, layout: Layout, requires_grad: bool = False):
@@ -286,7 +276,6 @@ class Emitter(Part):
         return {f"path{suffix}": parameters[path_name(name)], f"flow{suffix}": parameters[f"{name}.flow_rate"]}
 
     def begin(self, step: StepContext, state: State) -> None:
-        """Compute the motion of the column from the state before the step."""
         name = self.nozzle.name
         before = {"q_in": state[outlet_name(name)], "emitted_in": state[emitted_name(name)]}
         known = self.constants, self.parameters(step.parameters)

@@ -90,8 +90,7 @@ def reading(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Make two kernels. One copies a parameter's values in a step to the common array of parameters. The other adds the
-    adjoint of the common array to the adjoint of the parameter."""
+    """``pack`` copies a parameter's values in a step to the array ``table``. ``add`` does the reverse for adjoints."""
     typed = TypesByName(wp.array2d(dtype=precision.real), {wp.int32: "step"})
 
     @wp.kernel(module=arrays_module(precision, True, taped))
@@ -122,8 +121,6 @@ class Numbers:
         self.size = sum(sizes)
 
     def launch(self, kernel: str, step: StepContext, values: Parameters, table: wp.array) -> None:
-        """Launch a kernel. ``pack`` copies the values of a step to the array ``table``. ``add`` adds the adjoint of
-        ``table`` to the adjoints of the values."""
         for name, first, size in self._places:
             count = values[name].size * getattr(values[name].dtype, "_length_", 1)
             numbers = components(values[name], (self._members, count // self._members))
@@ -132,8 +129,6 @@ class Numbers:
 
 
 class OwnParameters:
-    """The parameters of a user-defined function, with tangent and adjoint, by names of kernel arguments."""
-
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._layout, own = layout, [one for one in parameters if one.axis is not Axis.ARRAY]
         self._numbers = Numbers(own, layout, taped)
@@ -143,7 +138,7 @@ class OwnParameters:
         options: dict[str, Any] = {"dtype": dtype, "device": layout.device}
         self._theta, self._theta_dot = wp.zeros(members, **options, requires_grad=taped), wp.zeros(members, **options)
         self._theta_bar = wp.zeros(layout.all_particles, **options)
-        """Terms of particles (n,) in the adjoint of the vector of parameters."""
+        """Terms of particles (n,) in the adjoint of ``theta``."""
         self._sum_theta = layout.sum_of(dtype) if own else None
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (members * max(self._size, 1))), 1)
@@ -164,7 +159,6 @@ class OwnParameters:
         return {**self._told(step, "_back"), "theta_bar": self._theta_bar, "rows": self.rows}
 
     def collect(self, step: StepContext, bar: Adjoints) -> None:
-        """Add the terms of particles to the adjoints of the parameters."""
         if self._sum_theta is not None:
             self._numbers.launch("add", step, bar.parameters, _flat(self._sum_theta(self._theta_bar)))
         if self._size:
@@ -283,8 +277,7 @@ class Formula:
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
-    """Read a user-defined function, and return it with the values of its parameters. ``kind`` is its name in messages.
-    Raise `InputError` if the function is invalid."""
+    """Return the formula and the values of parameters. Raise `InputError` if the function is invalid."""
     what = f"{kind} function {function.__name__}"
     taken, values = _arguments(what, function, parameters, INPUTS[kind])
     inputs = tuple(name for name in taken if name not in INPUTS[kind].fields)
@@ -371,11 +364,7 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, dimension: int, module: Any) -> Any:
-    """Make the Warp function that calls a user-defined function.
-
-    Its arguments are two vectors or numbers, the parameter vector, and the arguments of `Formula.takes` and
-    `Formula.reads`. In 2-D the z component of the result is 0.
-    """
+    """Make the Warp function that calls a user's function. In 2-D the z component of the result is 0."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in text.ranks[timed:])
     terms, first = [], 0

@@ -244,7 +244,6 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
 
 SAFETY = 0.5
-"""Safety factor of a diffusion substep."""
 MOST_SUBSTEPS = 10_000
 
 
@@ -257,8 +256,7 @@ def stable_substeps(
         dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 
     with the mobility M, the width eps and the curvature max f'' of the free energy. Beside a particle that is ``ratio``
-    times as heavy, a light particle diffuses up to (1 + ratio) / 2 times as fast. Raise `OutOfRangeError` for more than
-    `MOST_SUBSTEPS`.
+    times as heavy, a light particle diffuses up to (1 + ratio) / 2 times as fast.
     """
     mixture, cut = scene.mixture, scene.discretisation
     rate = laplacian_rate(smoothing_kernel(cut.kernel), cut.spacing, cut.support_radius, scene.dimension)
@@ -285,7 +283,6 @@ class Diffusion:
 
 @cache
 def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
-    """Make the kernels ``potential`` and ``flux`` of a diffusion substep, with derivatives."""
     discretisation, phases = diffusion.discretisation, diffusion.phases
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     fractions = precision.fractions(phases)

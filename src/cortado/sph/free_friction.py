@@ -39,7 +39,7 @@ def begun(body: Motions) -> Arrays:
 
 
 class BodyFriction:
-    """Arrays of the friction with one rigid body. ``suffix`` selects tangents or adjoints."""
+    """Arrays by kernel argument name. ``suffix`` is "_dot" for tangents and "_bar" for adjoints."""
 
     def __init__(self, layout: Layout, suffix: str = ""):
         precision, members = layout.precision, layout.members
@@ -50,13 +50,12 @@ class BodyFriction:
         motion = [f"{name}{suffix}" for name in VELOCITIES] + self._momenta
         self.arrays = layout.arrays(suffix, **kinds, **dict.fromkeys(("arm", "rub", "couple"), vector))
         self.arrays |= zeros(dict.fromkeys(motion, (members, vector)), layout.device)
-        """Arrays by names of kernel arguments: velocities before and after the solve, and momenta of the body."""
         self.turned = wp.zeros(members, dtype=vector, device=layout.device)
         self.none_total = wp.zeros(members, dtype=real, device=layout.device)
         self.impulse = {"impulse": wp.zeros(members, dtype=six, device=layout.device)}
 
     def momenta(self, body: Motions) -> Iterator[tuple[wp.array, wp.array, wp.array]]:
-        """Yield the momenta of the body, with the momenta by contacts and by the pressures of the previous step."""
+        """Yield arrays of the total momentum, of the momentum by contacts, and of the momentum by pressures."""
         return zip((self.arrays[one] for one in self._momenta), body.given.values(), body.pressed.values(), strict=True)
 
     def add_up(self, body: Motions) -> None:
@@ -85,7 +84,7 @@ class BodyRows:
 
 
 class FreeFriction:
-    """The friction between the fluid and all no-slip free bodies. Without no-slip bodies the methods do nothing."""
+    """All methods do nothing in scenes without no-slip bodies."""
 
     def __init__(self, setting: Setting, constants: Named):
         layout, scene = setting.layout, setting.scene
@@ -133,13 +132,11 @@ class FreeFriction:
         step.launch(kernel, *groups, begun(body), *body.known(step), threads=self.layout.members)
 
     def pull(self, step: StepContext, *known: Named, v: wp.array, solves: bool = False) -> None:
-        """Add the terms of rigid bodies to the velocity sums and stresses of particles with velocities ``v``. With
-        ``solves``, the velocities of bodies are from the vector of the solve."""
+        """With ``solves``, bodies have the velocities ``V`` and ``W`` of `BodyRows`."""
         for _, own, rows in self.each(step):
             step.launch(self.kernels.pull, rows.velocities if solves else {}, own.arrays, self.constants, *known, v=v)
 
     def push(self, step: StepContext, *known: Named, v: wp.array, acceleration: wp.array) -> None:
-        """Add the friction of rigid bodies to the accelerations of particles with velocities ``v``."""
         for _, own, rows in self.each(step):
             step.launch(self.kernels.rub.forward, own.arrays, self.constants, *known, v=v)
             add(own.arrays["rub"], acceleration)
@@ -147,20 +144,17 @@ class FreeFriction:
             wp.copy(rows.arrays["r"], own.whole())
 
     def multiply(self, step: StepContext, known: tuple[Named, ...], p: wp.array, found: Named) -> None:
-        """Add the terms of rigid bodies to the product of the solve's matrix and the vector ``p``."""
         for _, own, rows in self.each(step):
             step.launch(self.kernels.push, rows.velocities, own.arrays, self.constants, found, *known, v=p)
             rows.load = own.whole()
 
     def finish(self, step: StepContext) -> None:
-        """Add the impulses of the solve to the momenta of bodies, and write their velocities after the step."""
         for body, own, rows in self.each(step):
             rows.launch(step, rows.kernels.give, body.given, own.impulse)
         self.start(step)
 
     def act(self, step: StepContext, solid: int, name: str, total: wp.array, now: Named) -> None:
-        """Add the action of rigid bodies to ``total``, the action of one or all solids. ``name`` is "rub" or
-        "couple"."""
+        """Add accelerations to ``total`` if ``name`` is "rub". Add couples if ``name`` is "couple"."""
         for body, own, _ in self.each(step):
             if solid in (ALL_WALLS, body.table.number):
                 step.launch(self.kernels.rub.forward, own.arrays, self.constants, now)
@@ -268,12 +262,10 @@ class FrictionAdjoint(FrictionChanges):
                 array.zero_()
 
     def take(self, step: StepContext, bar: Adjoints) -> None:
-        """Start the adjoint solve from the adjoints of the impulses on rigid bodies."""
         for change, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.take, change.given)
 
     def heed(self, step: StepContext, bar: Adjoints) -> None:
-        """Write the residuals of rigid bodies in the adjoint solve."""
         for _, _, _, rows in self._each(step, bar):
             rows.launch(step, rows.kernels.heed, load=rows.load)
 
@@ -319,8 +311,7 @@ class FrictionAdjoint(FrictionChanges):
             self._shared(step, kernels.lean.adjoint, change.before, change.body.before, *groups)
 
     def finish(self, step: StepContext, bar: Adjoints, u_bar: wp.array) -> None:
-        """Apply the adjoints of the bodies' final velocities. ``u_bar`` is the adjoint of the particles' final
-        velocities."""
+        """``u_bar`` is the adjoint of the particles' velocities after the step."""
         of = self._friction
         if of.rows:
             share, sizes = self._shares["V_bar"], {"time_step_bar": bar.parameters["time_step"]}

@@ -39,7 +39,6 @@ GIVEN = ("pushed", "twisted")
 
 @cache
 def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a free body in 2 or 3 dimensions, for the predicted pose and for the state after the step."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     flat, rotation, hold = rotations(precision, dimension), rotations(precision, 3).rotation, hold_functions(precision)
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
@@ -137,7 +136,7 @@ class FreeTable:
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Return the effective volume of the body and its greatest inverse inertia, by names of kernel arguments."""
+        """A body that cannot move has an infinite volume. A body that cannot turn has an inverse inertia of 0."""
         goes, turns = any((*self.hold.moving, *self.hold.arm)), self.hold.turning > 0
         greatest = np.linalg.eigvalsh(np.linalg.pinv(self.mass.inertia)).max()
         return {"pushed_volume": self.mass.volume if goes else np.inf, "greatest": float(greatest) if turns else 0.0}
@@ -176,15 +175,13 @@ class Push(Protocol):
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
-    """Return the momenta of two rigid bodies, or the tangents or adjoints of the momenta. If ``other`` is -1, return
-    the arrays of the first body twice."""
+    """Return the momenta of two rigid bodies by kernel argument name. An ``other`` of -1 gives the first body twice."""
     others = each[body if other < 0 else other].given
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
 
 class Motions:
-    """Arrays (members,) by names of kernel arguments: velocities before and after the solve for pressures, and momenta
-    that a body gets. ``suffix`` selects tangents or adjoints."""
+    """Vectors (members,) by kernel argument name, for example velocities before and after the solve for pressures."""
 
     def __init__(self, layout: Layout, suffix: str = ""):
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
@@ -223,7 +220,7 @@ class FreeBody(Motions):
 
 
 class Changes(Motions):
-    """Tangents or adjoints of a body."""
+    """Tangents or adjoints of a body's motion."""
 
     def __init__(self, body: FreeBody, layout: Layout, suffix: str):
         super().__init__(layout, suffix)
@@ -232,7 +229,6 @@ class Changes(Motions):
         """Adjoint of a small rotation of the body, from the end of the step."""
 
     def known(self, of: Parameters, state: State) -> dict[str, wp.array]:
-        """Return the changes of the parameters and of the body's state, by names of kernel arguments."""
         names = {"time_step": "time_step", "gravity": "gravity", "density": self.body.table.weight}
         sizes = {f"{label}{self._suffix}": of[name] for label, name in names.items()}
         return {**self.body.state(state, self._suffix), **self.body.state(state, f"_new{self._suffix}"), **sizes}

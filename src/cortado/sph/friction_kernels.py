@@ -40,8 +40,7 @@ from cortado.sph.stress_kernels import fluidity_function, traction_function
 
 @cache
 def friction_functions(precision: Precision) -> SimpleNamespace:
-    """Make three Warp functions of the friction: ``lean`` for the velocity sums of a particle, ``rub`` for its
-    acceleration and couple, and ``bear`` for force and torque on the body."""
+    """``rub`` returns a particle's acceleration and couple. ``bear`` returns force and torque on the body."""
     real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
 
@@ -67,11 +66,8 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
 
 @cache
 def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """Make the kernels of friction with a rigid body in 2 or 3 dimensions.
-
-    ``hold`` computes sums over the body's wall particles. ``hang`` subtracts the velocity change by gravity.
-    ``thicken``, ``pull`` and ``push`` add the terms of the body to the sums, stresses and accelerations of particles.
-    """
+    """``hold`` computes the sums H, Y and N. ``thicken``, ``pull`` and ``push`` add the terms of the body to sums,
+    stresses and accelerations of particles."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     matrix, six, known = precision.matrix, precision.six, moment_functions(precision, dimension)
     contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
@@ -181,7 +177,6 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
 
 @cache
 def lift_kernels(precision: Precision) -> Kernels:
-    """Make the kernels of the negative velocity change by gravity in a step."""
     real, vector = precision.real, precision.vector
 
     def lift(time_step_i: real, gravity_i: vector) -> vector:
@@ -192,12 +187,9 @@ def lift_kernels(precision: Precision) -> Kernels:
 
 @cache
 def row_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of a body's unknowns in the viscous solve, with a thread for each scene. The unknowns of a body
-    are six numbers: momentum and angular momentum.
-
-    `cortado.sph.viscous_solve` calls ``lift``, ``begin``, ``multiply``, ``descend`` and ``turn``. ``give`` adds the
-    impulse of the solution to the body's momenta. ``take``, ``heed`` and ``answer`` are for the adjoint solve.
-    """
+    """Kernels have a thread for each scene. The unknowns of a body are six numbers: momentum and angular momentum.
+    ``give`` adds the impulse of the solution to the body's momenta. ``take``, ``heed`` and ``answer`` are for the
+    adjoint solve."""
     real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
     module, hold = free_module(precision, "rows"), hold_functions(precision)
     spin = hold.spin

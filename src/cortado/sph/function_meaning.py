@@ -26,7 +26,7 @@ REMAINDER, QUOTIENT, NEAREST, WHOLE = "cortado_remainder", "cortado_quotient", "
 
 @cache
 def meanings(precision: Precision) -> dict[str, Any]:
-    """Make Warp functions of Python's operators, by name. a % b and a // b are equal to CPython's bit for bit."""
+    """The Warp functions of a % b and a // b are equal to CPython's operators bit for bit."""
     real, module = precision.real, kernel_module(f"python_{precision.name}")
     none, one, half = (wp.constant(real(value)) for value in (0.0, 1.0, 0.5))
 
@@ -226,11 +226,9 @@ MOST_TURNS = 256
 def text_for_warp(
     what: str, function: ast.FunctionDef, frozen: Frozen, shapes: Mapping[str, tuple[int, ...]], kind: str
 ) -> str:
-    """Return the source code of a user-defined function for Warp. ``shapes`` are the shapes of arrays by name.
-
-    Raise `InputError` for code that Warp does not support, cannot differentiate, or interprets differently from Python.
-    Also raise `InputError` if the function may not return a ``kind``.
-    """
+    """Return the source code of a user's function for Warp. ``shapes`` are the shapes of arrays by name. Raise
+    `InputError` for code that Warp does not support, cannot differentiate, or interprets differently from Python. Also
+    raise `InputError` if the function may not return a ``kind``."""
     for helper in frozen.helpers:
         tree = helper.adj.tree
         DerivativeCheck(what).visit(tree)
@@ -255,7 +253,6 @@ MATH = (
 
 
 def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for calls of functions that Warp does not have, except names in `BUILTINS` and `MATH`."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Call):
             continue

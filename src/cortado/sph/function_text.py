@@ -32,7 +32,6 @@ _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
 
 
 def plain_function(kind: str, function: Any) -> FunctionType:
-    """Return the Python function of a user's function or Warp function. Raise `InputError` for any other object."""
     plain = function.func if isinstance(function, wp.Function) else function
     if not isinstance(plain, FunctionType):
         raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
@@ -49,7 +48,6 @@ def check_bare(what: str, function: Any) -> None:
 
 
 def source_of(what: str, function: FunctionType) -> str:
-    """Return the source code of a function. Raise `InputError` if it cannot be found."""
     if function in SENT:
         return SENT[function]
     try:
@@ -59,8 +57,7 @@ def source_of(what: str, function: FunctionType) -> str:
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
-    """Parse the source code of a function, without annotations, defaults and decorators. Raise `InputError` if the
-    source code does not match the function, for example because its file has changed since the import."""
+    """Parse ``source`` without annotations. Raise `InputError` if ``function`` was compiled from different code."""
     try:
         found: ast.AST = ast.parse(source).body[0]
     except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
@@ -114,10 +111,7 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 
 
 class Frozen:
-    """Copies of all outside values that a function and the functions it calls read.
-
-    The values are numbers, vectors, attributes of modules and objects, and ``@wp.func`` functions.
-    """
+    """Copies of all outside values that a function and the functions it calls read."""
 
     def __init__(self, what: str, function: FunctionType):
         self._what, self._made = what, dict[Any, Any]()
@@ -172,8 +166,7 @@ class Frozen:
 
 
 class DerivativeCheck(ast.NodeVisitor):
-    """Raises an error for code with wrong derivatives in Warp: loops that are not unrolled, and assignments to single
-    components."""
+    """Refuses code with wrong derivatives in Warp: loops that are not unrolled, and assignments to components."""
 
     def __init__(self, what: str, most: int = wp.config.max_unroll):
         self._what, self._most = what, most
@@ -221,7 +214,6 @@ def returns(body: list[ast.stmt]) -> bool:
 
 
 def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapping[str, Any]) -> None:
-    """Raise `InputError` for unknown names, and for outside arrays and lists."""
     for node in ast.walk(function):
         if not isinstance(node, ast.Name) or node.id in own:
             continue
@@ -263,10 +255,8 @@ def code_words(value: Any) -> str:
 
 
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
-    """Return lines of text that identify what a value computes. The lines are equal in every process.
-
-    For objects and for a user's modules, only the attributes ``names`` are included.
-    """
+    """Return lines of text that identify what a value computes. The lines are equal in every process. For objects and
+    for a user's modules, only the attributes ``names`` are included."""
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):
         return [repr(value)]

@@ -31,14 +31,12 @@ def mixture_module(precision: Precision, phases: int, forward: bool, taped: bool
 
 @cache
 def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNamespace:
-    """Make the kernels for a number of phases. ``order`` sorts mass fractions, and ``blend`` computes densities and
-    viscosities. Properties of phases are arrays (members, phases)."""
+    """Properties of phases are arrays (members, phases)."""
     real, fractions = precision.real, precision.fractions(phases)
     tiny, numbers = wp.constant(real(precision.tiny)), wp.array2d(dtype=real)
 
     @wp.func
     def logarithm(viscosity: real) -> real:
-        """Return the logarithm of a viscosity, finite for a viscosity of 0."""
         return wp.log(viscosity + tiny)
 
     materials = {numbers: "rest_density viscosity", wp.array(dtype=fractions): "c_scene"}
@@ -131,7 +129,6 @@ class MixtureAdjoint(PartAdjoint):
         self._y, self._z = part.fractions(), part.fractions()
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
-        """Convert the adjoint of the new mass fractions to the adjoint of the old mass fractions, in scene order."""
         mixture, kernels, known, fractions_bar = self.part, self.part.kernels, bar.named, state_bar.mass_fractions
         substeps, c_bar, y, z = mixture.substeps, bar.fractions, self._y, self._z
         with nullcontext() if substeps else step.aside():

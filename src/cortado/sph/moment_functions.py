@@ -31,8 +31,7 @@ def cross_terms_function(precision: Precision) -> Any:
 
 @cache
 def symmetric(precision: Precision) -> SimpleNamespace:
-    """Make Warp functions of symmetric matrices. A matrix is stored as its diagonal and its components yz, xz and xy.
-    ``kind`` is the Warp type, ``pack`` converts a 3 x 3 matrix, and ``times`` multiplies by a vector."""
+    """A symmetric matrix is stored as its diagonal and its components yz, xz and xy."""
     vector, matrix, six = precision.vector, precision.matrix, precision.six
 
     @wp.func

@@ -39,9 +39,7 @@ from cortado.sph.parts import Adjoints, Part, PartAdjoint, PartTangent, StepCont
 
 @cache
 def hold_type(precision: Precision) -> Any:
-    """Return the Warp struct of a body's degrees of freedom. ``moving`` is 1 along axes of free motion, else 0. ``arm``
-    is the vector from the centre of mass to the hinge [m]. ``turning`` is the number of free axes of rotation, and
-    ``axis`` the free axis if ``turning`` is 1 or the fixed axis if ``turning`` is 2."""
+    """The fields are explained in `cortado.scene.links.Hold`."""
     vectors = dict.fromkeys(("moving", "arm", "axis"), precision.vector)
     return struct_of("HoldNumbers", precision, **vectors, turning=wp.int32)
 
@@ -56,12 +54,7 @@ def hold_numbers(hold: Hold, precision: Precision) -> Any:
 
 @cache
 def hold_functions(precision: Precision) -> SimpleNamespace:
-    """Make the Warp functions of a body's degrees of freedom.
-
-    ``freed`` returns the part of an angular velocity about free axes. ``rate`` transforms a matrix by a rotation and
-    multiplies it by a vector. ``spin`` returns the angular velocity for an angular momentum. ``root`` multiplies a
-    vector by a square root of the inverse inertia.
-    """
+    """``root`` multiplies a vector by a square root of the inverse inertia."""
     vector, matrix, hold = precision.vector, precision.matrix, hold_type(precision)
 
     @wp.func
@@ -108,14 +101,12 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
 
 
 def free_module(precision: Precision, topic: str = "bodies") -> Any:
-    """Return the Warp module for kernels of free bodies. Use a separate ``topic`` for kernels that only some bodies
-    need, because Warp recompiles a module if its kernels differ."""
+    """Kernels that only some bodies need have their own ``topic``: Warp compiles a changed module again."""
     return kernel_module(f"free_{topic}_derivative_{precision.name}")
 
 
 @cache
 def move_kernels(precision: Precision) -> Kernels:
-    """Make the kernels that move a rigid body by gravity and by its momenta."""
     real, vector, matrix, hold = precision.real, precision.vector, precision.matrix, hold_functions(precision)
     spin, vectors = hold.spin, "gravity V W L pulled twisted"
 
@@ -142,8 +133,7 @@ SMALL = 1e-3
 
 @cache
 def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
-    """Make the Warp type ``angle``, a number in 2-D and a vector in 3-D, and the Warp function ``rotation``, which
-    returns the rotation matrix."""
+    """The Warp type ``angle`` is a number in 2-D and a vector in 3-D. ``rotation`` returns the rotation matrix."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     @wp.func
@@ -188,8 +178,6 @@ FIELDS = {"position": position_name, "turn": turn_name, "rotation": rotation_nam
 
 @cache
 def pose_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels]:
-    """Make the kernels of a moving solid in 2 or 3 dimensions: for the poses before and after a step, and for the
-    state."""
     real, vector, matrix, of = precision.real, precision.vector, precision.matrix, rotations(precision, dimension)
     angle, rotation = of.angle, of.rotation
 
@@ -262,8 +250,6 @@ class MovingSolidsAdjoint(PartAdjoint):
 
 
 class MovingSolidsPart(Part):
-    """The part of a step that moves the walls of moving solids."""
-
     derivatives = MovingSolidsTangent, MovingSolidsAdjoint
 
     def __init__(self, made_of: MovingSolids, layout: Layout):

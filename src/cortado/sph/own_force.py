@@ -82,7 +82,6 @@ class OwnFunction(ABC):
     """Base class of user-defined forces that are given as one Python function; see `cortado.forces`."""
 
     kind: ClassVar[str]
-    """Name of the kind of force in messages."""
 
     def __init__(self, function: Callable[..., Any], /, name: str | None = None, **parameters: Any):
         """Take a ``function`` defined by ``def``, and values for the ``parameters`` of the function.
@@ -142,10 +141,8 @@ class OwnFunction(ABC):
 
 class OwnForce(OwnFunction):
     _made_by: ClassVar[Callable[[Discretisation, Formula, int], Kernels]]
-    """Function that makes the kernels of the force in 2 or 3 dimensions."""
 
     def kernels(self, discretisation: Discretisation, dimension: int, phases: int = 1) -> Kernels:
-        """Make the kernels of the force."""
         return type(self)._made_by(discretisation, self._formula.of_phases(self._what, phases), dimension)
 
     def force(self, setting: Setting) -> "FunctionForce":
@@ -328,8 +325,7 @@ class Rheology(OwnFunction):
     """Module of the scene's force that this law replaces."""
 
     def force(self, setting: Setting) -> ViscousStress:
-        """Make the viscous force with this law. Raise `InputError` if Warp cannot compile the function, or if the
-        function returns a negative or infinite viscosity."""
+        """Raise `InputError` if the function cannot be compiled, or returns a negative or infinite viscosity."""
         if setting.scene.forces.viscosity != "stress":
             found = f"forces.viscosity is {setting.scene.forces.viscosity!r}"
             raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")

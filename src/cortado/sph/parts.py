@@ -101,8 +101,7 @@ class Shares(Arrays):
     """Terms of particles in the adjoints of parameters (n,), before summation."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
-        """Allocate terms of the parameters ``names``, all 0. Raise `TypeError` for a parameter without terms of
-        particles."""
+        """Raise `TypeError` for a parameter whose adjoint has no terms of particles."""
         precision, self.known, kinds = layout.precision, layout.known, {}
         of_phases = precision.fractions(layout.phases)
         dtypes = {Axis.SCALAR: (precision.real, precision.vector), Axis.PHASE: (of_phases, of_phases)}
@@ -134,11 +133,8 @@ class Adjoints:
 
     @cached_property
     def named(self) -> tuple[Named, ...]:
-        """Return the adjoints by kernel argument name, such as ``x_bar``.
-
-        Adjoints of parameters over time are sums (members, steps). Adjoints of parameters in ``shares`` are terms of
-        particles (n,), which are summed later.
-        """
+        """Return the adjoints by kernel argument name, such as ``x_bar``. Adjoints of parameters over time are sums
+        (members, steps). Adjoints of parameters in ``shares`` are terms of particles (n,), which are summed later."""
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         return self.fields.named("_bar"), {"fractions_bar": self.fractions}, self.shares.named("_bar"), whole
@@ -329,8 +325,7 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Return the Warp module for kernels without a smoothing kernel. Kernels that only few scenes use need their own
-    ``topic``."""
+    """Kernels that only few scenes use have their own ``topic``: Warp compiles a changed module again."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 
@@ -395,7 +390,6 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 @cache
 def begin_adjoint_kernel(precision: Precision) -> Any:
-    """Make the kernel that converts the adjoint of the new state to the adjoint of the predicted state."""
     real, vector = precision.real, precision.vector
     adjoin_prediction = prediction_share(precision)
     typed = TypesByName(real, {wp.int32: "order", vector: "v", wp.array(dtype=vector): "x_scene v_scene"})

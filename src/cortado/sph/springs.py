@@ -48,7 +48,6 @@ TURNED = {name: f"{name}_turn" for name in ("R_0", "R", "E_0", "E")}
 
 @cache
 def constants_types(precision: Precision) -> tuple[Any, Any]:
-    """Return the Warp structs of the constants of a spring and of a hinge."""
     vector, matrix, both = precision.vector, precision.matrix, {"is_free": wp.bool}
     spring, hinge = {"own": vector, "anchor": vector, "slack": wp.bool}, {"begun": matrix, "other_begun": matrix}
     return struct_of("Spring", precision, **spring, **both), struct_of("Hinge", precision, axis=vector, **hinge, **both)
@@ -56,8 +55,7 @@ def constants_types(precision: Precision) -> tuple[Any, Any]:
 
 @cache
 def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
-    """Make the kernels of springs and hinges: for the momentum by a spring, for its force and length, and for the
-    angular momentum by a hinge."""
+    """Make the kernels of the momentum by a spring, of its force and length, and of the angular momentum by a hinge."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     (spring_of, hinge_of), kinds = constants_types(precision), {vector: "c_0 c e_0 e W", matrix: "R_0 R E_0 E"}
     taut, tiny, no, one = (wp.constant(real(value)) for value in (TAUT, precision.tiny, 0.0, 1.0))
@@ -65,8 +63,7 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
 
     @wp.func
     def tension(k: real, rest: real, c: real, dt: real, d: vector, moved: vector, slack: bool) -> real:
-        """Return the tension of a spring. ``d`` is the vector between its ends, and ``moved`` the change of this vector
-        in a step."""
+        """``d`` is the vector between the ends of a spring. ``moved`` is the change of ``d`` in a step."""
         length = wp.sqrt(wp.dot(d, d) + tiny)
         longer, rate = length - rest, wp.dot(d, moved) / (length * dt)
         found = k * longer + c * rate
@@ -129,7 +126,6 @@ class Springs:
         self._rest = resting_pose(layout)
 
     def ends(self, of: Ends | Joint) -> Named:
-        """Return the poses of the two solids and the tangents of the poses, by names of kernel arguments."""
         found: dict[str, wp.array] = {}
         each = self.part.made_of.walls.each
         pose, other_pose = each[self.number(of.body)], self._rest if of.against < 0 else each[of.against]
@@ -139,7 +135,6 @@ class Springs:
         return found
 
     def known(self, of: Ends | Joint) -> tuple[Named, ...]:
-        """Return the kernel arguments of a spring or hinge, without its parameters."""
         precision, (spring_of, hinge_of) = self.layout.precision, constants_types(self.layout.precision)
         if isinstance(of, Ends):
             spring = spring_of()
@@ -191,8 +186,6 @@ class SpringsTangent:
 
 
 class PoseBars:
-    """Adjoints of the poses of the two solids, by names of kernel arguments."""
-
     def __init__(self, springs: Springs):
         self._springs, layout = springs, springs.layout
         names = (TURNED.get(name, name) for own, other, *_ in POSES for name in (own, other))

@@ -82,7 +82,6 @@ def contact_functions(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace:
-    """Make the sums over neighbours for the viscous acceleration, with derivatives."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -163,7 +162,6 @@ def work_types(precision: Precision) -> TypesByName:
 
 
 def stress_work(d: Discretisation) -> Any:
-    """Make the Warp function for the adjoints of solids, given the adjoint of the viscous acceleration."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold = contact.fall, contact.hold
 
@@ -250,8 +248,7 @@ def trial_kernel(precision: Precision, law: Formula) -> Any:
 def check_law(
     what: str, law: Formula, viscosities: Mapping[str, float], thetas: np.ndarray, precision: Precision, device: Any
 ) -> None:
-    """Raise `InputError` if a law returns an invalid viscosity. ``viscosities`` are the viscosities of phases by name,
-    and ``thetas`` the parameters of the law."""
+    """``viscosities`` are the viscosities of phases by name, and ``thetas`` the parameters of the law."""
     kernel, theta_type = trial_kernel(precision, law), theta_of(precision, law.ranks)
     rows = np.zeros((len(thetas), theta_type._length_))
     rows[:, : thetas.shape[1]] = thetas

@@ -109,7 +109,6 @@ def traction_function(precision: Precision, dimension: int, module: Any) -> Any:
 
 
 def stress_of_particle(precision: Precision, dimension: int, law: Formula, module: Any) -> Callable[..., Any]:
-    """Make the Warp function of the stress and the viscosity of a particle in 2 or 3 dimensions."""
     real, matrix, fluidity = precision.real, precision.matrix, fluidity_function(precision)
     part, regular = part_functions(precision, dimension)
     inverse, traction = moment_functions(precision, dimension).inverse, traction_function(precision, dimension, module)
@@ -134,8 +133,7 @@ def stress_of_particle(precision: Precision, dimension: int, law: Formula, modul
 
 @cache
 def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
-    """Make the Warp functions of the sums over neighbours for the velocity gradient and the mean viscosity, with
-    derivatives. Walls are no-slip walls if ``sticks`` is true."""
+    """Walls are no-slip walls if ``sticks`` is true."""
     precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
@@ -214,7 +212,6 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
 
 def moments_work(d: Discretisation) -> Any:
-    """Make the Warp function for the adjoints of solids, given the adjoints of the sums over neighbours."""
     precision, real, contact = d.precision, d.precision.real, contact_functions(d)
     fall, hold, fluidity = contact.fall, contact.hold, fluidity_function(precision)
 
@@ -229,12 +226,7 @@ def moments_work(d: Discretisation) -> Any:
 
 @cache
 def stress_kernels(discretisation: Discretisation, dimension: int, law: Formula, sticks: bool) -> SimpleNamespace:
-    """Make the kernels of the viscous stress in 2 or 3 dimensions, with a law of viscosity.
-
-    ``moments`` computes sums over neighbours. ``stress`` computes the stress and the viscosity. ``force`` computes the
-    acceleration. ``control`` is the damping coefficient, ``theta`` are the parameters of the law, and ``eta`` is the
-    viscosity.
-    """
+    """``control`` is the damping coefficient C, ``eta`` the viscosity, and ``theta`` the parameters of the law."""
     precision = discretisation.precision
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     modules = discretisation.modules(f"viscous_stress_{law.topic}{dimension}d" + "_no_slip" * sticks)

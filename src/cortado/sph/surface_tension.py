@@ -41,7 +41,6 @@ PART = 2.0 / 3.0
 
 
 def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
-    """Make the Warp function for a pair's term in the acceleration by surface tension."""
     real, vector, neighbourhood = discretisation.types
     part, one = wp.constant(real(PART)), wp.constant(real(1.0))
 
@@ -65,7 +64,6 @@ def tension_term(discretisation: Discretisation) -> Callable[..., Any]:
 
 @cache
 def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the acceleration by surface tension."""
     modules = discretisation.modules("surface_tension")
     total = fluid_sum(discretisation)(tension_term(discretisation))
     tangent = made_tangent(discretisation, tension_term, modules[1])
@@ -76,7 +74,6 @@ def surface_tension_kernels(discretisation: Discretisation) -> Kernels:
 
 @cache
 def normal_kernels(discretisation: Discretisation) -> Kernels:
-    """Make the kernels of the surface normals."""
     real, vector, neighbourhood = discretisation.types
     one = wp.constant(real(1.0))
 
@@ -139,8 +136,7 @@ RELAXED = {2: 1.1, 3: 1.25}
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
 """Smallest support radius for each kind of surface tension [spacings]."""
 LEAST_VISCOSITY = 0.05
-"""Smallest viscosity of stable drops, divided by sqrt(rho sigma R), with density rho, surface tension sigma and radius
-R [-]."""
+"""Smallest viscosity of stable drops, divided by sqrt(density * surface tension * radius) [-]."""
 
 
 class SurfaceTension:

@@ -31,8 +31,6 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 
 @cache
 def pairwise(discretisation: Discretisation) -> SimpleNamespace:
-    """Make the Warp functions of a pair's viscous term: ``force``, ``tangent``, and the adjoints ``adjoint_x`` and
-    ``adjoint_v`` with respect to position and velocity."""
     real, vector, neighbourhood = discretisation.types
     pair = pair_functions(discretisation)
     slope, slope_change, per_size = pair.slope, pair.slope_change, pair.per_size
@@ -65,8 +63,7 @@ def pairwise(discretisation: Discretisation) -> SimpleNamespace:
 
 @cache
 def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
-    """Make the kernels of the viscous acceleration. Walls are no-slip walls if ``sticks`` is true. The derivatives
-    leave walls out; see `viscosity_term`."""
+    """The derivatives leave walls out; see `viscosity_term`."""
     real, vector, neighbourhood = discretisation.types
     phi = pairwise(discretisation)
     phi_force, phi_tangent, phi_adjoint_x, phi_adjoint_v = phi.force, phi.tangent, phi.adjoint_x, phi.adjoint_v
@@ -181,7 +178,6 @@ class Viscosity:
 
 
 def force(setting: Setting) -> Viscosity | ViscousStress | None:
-    """Make the viscous force of a scene, or return None without viscosity."""
     form = setting.scene.forces.viscosity
     if form == "stress":
         return stress_of(setting.scene)(setting)

@@ -50,7 +50,7 @@ def operator_kernels(discretisation: Discretisation, dimension: int, law: Formul
 
 @cache
 def solve_kernels(precision: Precision) -> SimpleNamespace:
-    """Make the kernels of conjugate gradients. ``going`` (members,) is 1 for scenes that still iterate."""
+    """``going`` (members,) is 1 for scenes that still iterate."""
     real, vector = precision.real, precision.vector
     module = kernel_module(f"conjugate_gradients_{type_name(vector)}")
     typed = TypesByName(real, {vector: "r p y product", wp.int32: "count going active"})
@@ -115,8 +115,6 @@ MOST = 1_000
 
 
 class Solve:
-    """Solves the linear system of the implicit viscous stress."""
-
     name, most = "viscous_iterations", MOST
 
     def __init__(self, layout: Layout, operator: tuple[Any, Any], free: FreeFriction):
@@ -172,7 +170,6 @@ class Solve:
         self._free.multiply(step, known, p, self._own)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Multiply the matrix by the bodies' velocities and the particle velocities ``still``. Add the product to
-        ``r``."""
+        """Add the matrix times velocities to ``r``. Particles have the velocities ``still``."""
         self._apply(step, known, still)
         add(self._own["product"], r)

@@ -45,13 +45,12 @@ CLOSEST = 0.25
 
 
 class ViscousStress:
-    """The explicit viscous force as a stress. Its arrays are from the last step."""
+    """The tangent and the adjoint read arrays of the last call of `accelerate`."""
 
     shares: tuple[str, ...] = ()  # viscosities reach particles through the mixture, which has the phases' adjoints
     batches = True
 
     def __init__(self, setting: Setting, law: Formula | None = None, parameters: Sequence[Parameter] = ()):
-        """Prepare the force with a ``law`` of viscosity and its parameters. The default is a Newtonian fluid."""
         scene, discretisation, layout = setting.scene, setting.discretisation, setting.layout
         cut, self._law = scene.discretisation, law or newtonian_law()
         self._made_for = (discretisation, scene.dimension, self._law, scene.sticks)
@@ -72,7 +71,6 @@ class ViscousStress:
         return self._layout.arrays(requires_grad=taped, **kinds)
 
     def compile(self, what: str) -> None:
-        """Compile the kernels with the law of viscosity. Raise `InputError` if Warp cannot compile them."""
         compiled(what, self._kernels.stress.forward.module, self._layout.device, "number")
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
@@ -92,7 +90,7 @@ class ViscousStress:
         step.launch(self._kernels.force.tangent, *known, acceleration_in_dot=before, acceleration_dot=after)
 
     def _stress_along(self, step: StepContext, dot: Tangents, resisted: Named | None = None) -> dict[str, wp.array]:
-        """Write the tangents of stress and viscosity. ``resisted`` are the arrays of `resisted` with tangents."""
+        """``resisted`` are velocities and velocity sums of the implicit force, with tangents."""
         change, known = {f"{name}_dot": a for name, a in self._change.items()}, (*dot.named, self.constants, self._of)
         free = self.free.dots
         free.begin(step, dot)
@@ -110,8 +108,7 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """Add to the adjoints of the force's inputs, given the adjoint of the acceleration and the arrays of
-        `resisted`."""
+        """The arrays ``now`` are those that `resisted` returns."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
@@ -122,8 +119,7 @@ class ViscousStress:
         self._give(step, bar, 1, *known)
 
     def back_to_sums(self, step: StepContext, bar: Adjoints, bars: dict[str, wp.array], now: Named) -> None:
-        """Convert the adjoints of stress and viscosity to adjoints of particles and solids. ``now`` are the arrays of
-        `resisted`, and ``bars`` are adjoints of sums over neighbours."""
+        """The arrays ``now`` are those that `resisted` returns."""
         known = self._own.back(step), bars, now, *bar.named, self.constants, self._of
         step.launch(self._kernels.stress.adjoint, *known)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
@@ -163,8 +159,6 @@ class ViscousStress:
 
 
 class StressWalls:
-    """The action of walls on particles through the viscous stress."""
-
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
         """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in `FreeFriction`."""
         self._stress, self._layout, self._name = stress, setting.layout, name
@@ -206,7 +200,6 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
     @particle_kernel(module, "u")
     def predict(time_step: real, v_i: vector, acceleration_i: vector) -> vector:
-        """Return the velocity after a time step with constant acceleration."""
         return v_i + time_step * acceleration_i
 
     @particle_kernel(module, "r")
@@ -225,8 +218,6 @@ def implicit_kernels(precision: Precision) -> SimpleNamespace:
 
 
 class ImplicitViscousStress(ViscousStress):
-    """The implicit viscous force, from the velocities at the end of a step. It is the last force of a step."""
-
     is_last = True
 
     def __init__(self, setting: Setting, law: Formula | None = None, parameters: Any = ()):
