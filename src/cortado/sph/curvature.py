@@ -57,7 +57,6 @@ class CurvatureConstants:
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
-        """Compute the constants for a lattice with this spacing [m] and support radius [m]."""
         width = float(np.mean([_width(kernel, support / spacing, dimension, cut) for cut in ((1, 0), (1, 1))]))
         shared = ACTS * dimension / (3.0 * (dimension - 1))
         return cls(spacing, width, spacing * (DEEP / (dimension - 1) + EXCESS - shared))

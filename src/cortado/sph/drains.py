@@ -59,7 +59,7 @@ class Mouth:
     shape: int
     middle: Points
     ends: Points
-    """Corners of a box relative to its middle (2, d) [m]. For a plane, both rows are its direction."""
+    """Corners of the box relative to the middle of the box (2, d) [m]. Both rows are the direction of a plane."""
     radius: float = 0.0
 
 

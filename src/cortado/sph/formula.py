@@ -224,7 +224,6 @@ class Formula:
 
     name: str
     text: str
-    """Source code of the function for Warp."""
     inputs: tuple[str, ...]
     """Names of the first arguments: two vectors or numbers, and optionally the time."""
     fields: tuple[str, ...]
@@ -236,9 +235,9 @@ class Formula:
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     phases: int = 0
     ranks: tuple[int, ...] = ()
-    """Numbers of axes of the parameters: 0 for a number and 1 for a vector."""
+    """Number of axes of each parameter: 0 for a number, 1 for a vector."""
     topic: str = ""
-    """For a law of viscosity: part of the names of its Warp modules, empty for Newtonian fluids."""
+    """Part of the names of Warp modules for a law of viscosity; empty for Newtonian fluids."""
 
     def of_phases(self, what: str, phases: int) -> "Formula":
         """Return the formula for this number of phases. Raise `InputError` if the function needs a different number."""

@@ -98,7 +98,7 @@ class FreeFriction:
             self.kernels = friction_kernels(setting.discretisation, scene.dimension)
             self.move, self.lifts = move_kernels(layout.precision), lift_kernels(layout.precision)
         self.lift = {"lift": wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)}
-        """Negative velocity change by gravity in a step."""
+        """Minus the velocity change by gravity in a step [m/s]."""
         self.dots, self.bars = FrictionTangent(self), FrictionAdjoint(self)
 
     def each(self, step: StepContext) -> Iterator[tuple[FreeBody, BodyFriction, BodyRows]]:

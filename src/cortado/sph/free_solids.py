@@ -187,7 +187,7 @@ class Motions:
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
-        """Momenta by contacts, springs and friction, and for no-slip bodies by the pressures of the previous step."""
+        """``given`` are momenta by contacts, springs and friction, ``pressed`` by pressures of the previous step."""
 
 
 class FreeBody(Motions):
@@ -220,13 +220,11 @@ class FreeBody(Motions):
 
 
 class Changes(Motions):
-    """Tangents or adjoints of a body's motion."""
-
     def __init__(self, body: FreeBody, layout: Layout, suffix: str):
         super().__init__(layout, suffix)
         self.body, self._suffix = body, suffix
         self.turned_end = wp.zeros(layout.members, dtype=layout.precision.vector, device=layout.device)
-        """Adjoint of a small rotation of the body, from the end of the step."""
+        """Adjoint of a small rotation of the body at the end of the step."""
 
     def known(self, of: Parameters, state: State) -> dict[str, wp.array]:
         names = {"time_step": "time_step", "gravity": "gravity", "density": self.body.table.weight}

@@ -58,7 +58,7 @@ def meanings(precision: Precision) -> dict[str, Any]:
 
 REAL, VECTOR = "cortado_real", "cortado_vector"
 PLACE, READ, READ_OF = "cortado_place", "cortado_read", ("cortado_e", "cortado_w", "cortado_member", "cortado_row")
-"""Names of the Warp functions that read arrays, and of their first arguments."""
+"""Names of the Warp functions that read arrays, and names of the first arguments of these functions."""
 _TYPES = {float: REAL, wp.float32: REAL, wp.float64: REAL, wp.vec3f: VECTOR, wp.vec3d: VECTOR}
 _OPERATORS: Mapping[type[ast.operator], str] = {ast.Mod: REMAINDER, ast.FloorDiv: QUOTIENT}
 _CALLS = {"round": NEAREST, "int": WHOLE}

@@ -42,7 +42,7 @@ POSES = (
     ("c", "e", "after", "after"),
     ("R", "E", "turns", "turned"),
 )
-"""For each pose before or after a step: the kernel arguments for the two solids, and the names of their arrays."""
+"""Kernel arguments of two solids and names of arrays, for each pose before or after a step."""
 TURNED = {name: f"{name}_turn" for name in ("R_0", "R", "E_0", "E")}
 
 
@@ -152,7 +152,6 @@ class Springs:
     def each(
         self, step: StepContext, bodies: Sequence[FreeBody | Changes]
     ) -> Iterator[tuple[Kernels, Ends | Joint, Sequence[str], tuple[Named, ...]]]:
-        """Yield the kernels, the spring or hinge, the names of its parameters, and its kernel arguments."""
         all_of: list[Ends | Joint] = [*self.springs, *self.turned]
         for of in all_of:
             kernels, ends = (self.pull, NUMBERS) if isinstance(of, Ends) else (self.twist, TURNING)

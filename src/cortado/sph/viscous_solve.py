@@ -163,7 +163,7 @@ class Solve:
         wp.capture_while(self._active, iterate)
 
     def _apply(self, step: StepContext, known: Any, p: wp.array) -> None:
-        """Write the product of the matrix and ``p``, and each particle's term of its scalar product with ``p``."""
+        """Write ``product``, the matrix times ``p``, and ``share``, each particle's term of ``p`` times ``product``."""
         step.launch(self._pull, *known, v=p)
         self._free.pull(step, *known, v=p, solves=True)
         step.launch(self._multiply, *known, self._own, v=p)

@@ -148,7 +148,7 @@ class ViscousStress:
             bar.solids.add(step.launch, kernel, *known, self._of, constants=constants)
 
     def resisted(self, step: StepContext) -> dict[str, wp.array]:
-        """Return the stress, the viscosity, the velocities ``v`` on which the stress acts, and their sums ``A_u``."""
+        """Return stress, viscosity, the velocities ``v`` that the stress resists, and the velocity sums ``A_u``."""
         return {**{name: self._of[name] for name in ("T", "eta")}, "A_u": self._of["A"], "v": step.fields["v"]}
 
     def resisted_tangent(self, step: StepContext, dot: Tangents) -> dict[str, wp.array]:
@@ -160,7 +160,7 @@ class ViscousStress:
 
 class StressWalls:
     def __init__(self, setting: Setting, stress: ViscousStress, work: WorkMaker, bar: str, name: str):
-        """Take ``work`` and ``bar`` of a `WallTerm`, and the ``name`` of the action in `FreeFriction`."""
+        """``work`` and ``bar`` are arguments of `WallTerm`. ``name`` is "rub" or "couple"."""
         self._stress, self._layout, self._name = stress, setting.layout, name
         term = WallTerm(setting.discretisation, "viscous_stress", work, bar, rubs=True)
         self._sums = WallSums(term, setting.layout, (stress.constants["least"], stress.constants["control"]))
@@ -255,7 +255,7 @@ class ImplicitViscousStress(ViscousStress):
         self._after = after
 
     def _find_end(self, step: StepContext, acceleration: wp.array) -> None:
-        """Write the velocities at the end of the step, and their velocity sums and stresses."""
+        """Write velocities, velocity sums and stresses at the end of the step."""
         step.launch(self._implicit.predict, acceleration=acceleration, u=self._u)
         self.free.hang(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)
@@ -296,7 +296,7 @@ class ImplicitViscousStress(ViscousStress):
         self.free.bars.finish(step, bar, v_bar)
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array:
-        """Apply the adjoint of the force, and return the adjoint of the sum of all earlier forces' accelerations."""
+        """Return the adjoint of the accelerations by all earlier forces."""
         step.launch(self._implicit.weigh, acceleration_bar=acceleration_bar, r=self._r)
         if self.free.rows:
             self.free.bars.take(step, bar)
