@@ -293,7 +293,7 @@ class Problem:
             return {}
         values, along = self._checked(parameters), self._space.checked(directions, "direction")
         moment, rows = moment_of(end), self._space.direction(self._rollout, values, along)[1].written
-        return moment.tangents(names, dot, row_of(self._rollout, rows, moment.row))
+        return moment.evaluator().tangents(names, moment, dot, row_of(self._rollout, rows, moment.row))
 
     @property
     def lost(self) -> Mapping[int, DivergedError]:

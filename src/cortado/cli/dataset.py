@@ -187,8 +187,7 @@ def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
     for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
         left_behind.unlink(missing_ok=True)
     if note.exists():
-        there = read_json(note)
-        if other := differences(there, json.loads(json.dumps(asked)), "missing"):
+        if other := differences(read_json(note), json.loads(json.dumps(asked)), "missing"):
             own = {key.removeprefix("scene."): pair for key, pair in other.items()}
             unlike = "; ".join(f"{key} is {shown(now)}, but must be {shown(old)}" for key, (old, now) in own.items())
             raise InputError(f"{file}: {unlike}, as in the data set in {out}; choose another --out.")

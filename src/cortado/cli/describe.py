@@ -84,8 +84,7 @@ class RunLength:
             self.trajectory = size + (28e3 + 24.0 * simulation.particles + 50.0 * self.steps)  # headers and diagnostics
         self.film: Pace | None = None
         if frames is not None and time is not None and 1 < frames <= 1_000_000 and picture.film_frames != 0:
-            times = np.linspace(0.0, time, frames)
-            self.film = Pace.of(times, picture.film_frames, picture.film_speed, choice.rate)
+            self.film = Pace.of(np.linspace(0.0, time, frames), picture.film_frames, picture.film_speed, choice.rate)
 
 
 def describe_scene(scene_file: Path, asked: RunRequest, picture: Path | None, as_json: bool) -> str:

@@ -254,8 +254,7 @@ def _solver(rollout: Rollout, trajectory: Trajectory, scene: Scene, folder: RunF
     converged = rollout.diagnostics["converged"]
     if not len(converged):
         return Section("The solver", figures=figures)
-    every = "The pressure converged in every step."
-    told = every if converged.all() else not_converged_sentence(converged, scene)
+    told = "The pressure converged in every step." if converged.all() else not_converged_sentence(converged, scene)
     torn = divergence_sentence(rollout.diagnostics, scene)
     return Section("The solver", [told, *([torn] if torn else [])], figures=figures)
 

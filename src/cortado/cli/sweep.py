@@ -58,8 +58,7 @@ def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Com
     keys, together = _values(options, "--set"), _values(zipped, "--zip")
     if both := keys.keys() & together.keys():
         raise InputError(f"--zip gives {min(both)}, which --set gives too, but must give other keys.")
-    lengths = {len(values) for values in together.values()}
-    if len(lengths) > 1:
+    if len(set(map(len, together.values()))) > 1:
         told = ", ".join(f"{len(values)} of {key}" for key, values in together.items())
         raise InputError(f"--zip gives {told}, but must give the same number of values for each key.")
     rows = [tuple(zip(together, row, strict=True)) for row in zip(*together.values(), strict=True)]
@@ -252,5 +251,4 @@ def _warn_of_times(member: Member, done: list[Combination]) -> None:
     last, off = max(ends.items(), key=lambda pair: abs(pair[1] - duration))
     if abs(off - duration) > 1e-9 * duration:
         found = f"not all combinations end at {duration:g} s, which is no whole number of their time steps"
-        advice = "Choose a --time that is a multiple of every time step."
-        warn(f"{found}: {last} ends at {off:g} s. {advice}")
+        warn(f"{found}: {last} ends at {off:g} s. Choose a --time that is a multiple of every time step.")

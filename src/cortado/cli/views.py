@@ -286,8 +286,7 @@ class LiveView:
             for slider, value in zip(sliders, values, strict=False):
                 slider.value = float(value)
         first = self.simulation.rollout(1)
-        frame = {**self.simulation.frame(first.initial), **self.simulation.constants(first)}
-        self._show(RestartState(frame))
+        self._show(RestartState({**self.simulation.frame(first.initial), **self.simulation.constants(first)}))
 
     def _show(self, state: RestartState) -> None:
         self._state = state
@@ -349,5 +348,4 @@ def opened(path: Path, overrides: list[str], device: str, precision: str | None,
         raise InputError(f"{path} has no trajectory, but must be the folder of `cortado run`, or a scene file.")
     folder.require_files()
     scene = folder.read_scene()
-    simulation = cache(lambda: Simulation(scene, device))
-    return RecordedView(scene, Trajectory.load(folder.trajectory), simulation, port)
+    return RecordedView(scene, Trajectory.load(folder.trajectory), cache(lambda: Simulation(scene, device)), port)

@@ -132,8 +132,7 @@ class FileLayout:
         places["cortado/frame_steps"] = _reserve(own, "frame_steps", (len(self.times),), np.int64)
         states, steps = own.create_group("states"), own.create_group("diagnostics")
         for name, array in self.others.items():
-            shape = (len(self.times), *array.shape)
-            places[f"cortado/states/{name}"] = _reserve(states, name, shape, array.dtype)
+            places[f"cortado/states/{name}"] = _reserve(states, name, (len(self.times), *array.shape), array.dtype)
         for name, dtype in self.diagnostics.items():
             places[f"cortado/diagnostics/{name}"] = _reserve(steps, name, (max(self.steps, 1),), dtype)
         return places

@@ -139,7 +139,7 @@ class SnapshotAdjoint:
         if not self.quantities:
             return self
         moment = moment_of(end)
-        fields, parameters = moment.adjoint(self.quantities)
+        fields, parameters = moment.evaluator().adjoint(self.quantities, moment)
         more = self.state.like()
         more.set(fields)
         for own, total in zip(self.state.arrays(), more.arrays(), strict=True):

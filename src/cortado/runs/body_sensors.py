@@ -55,8 +55,7 @@ class SpringLoads:
         return numbers_of(step.parameters, self._spring.name, NUMBERS), *self._springs.known(self._spring)
 
     def _found(self, step: StepContext, kernel: Any, found: str, *more: Named) -> wp.array:
-        out = {found: self._at["reading"]}
-        step.launch(kernel, out, *more, *self._known(step), threads=self._threads)
+        step.launch(kernel, {found: self._at["reading"]}, *more, *self._known(step), threads=self._threads)
         step.launch(self._widen, load=self._load, reading=self._at["reading"], threads=self._threads)
         return self._load
 

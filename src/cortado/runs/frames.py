@@ -204,8 +204,7 @@ def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
         found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
-        advice = "a smaller --record-every or more steps give more"
-        warn(f"{found}, as the run has no more; {advice}.")
+        warn(f"{found}, as the run has no more; a smaller --record-every or more steps give more.")
     return Pace.of(times, asked, picture.film_speed, rate)
 
 

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from cortado.device.launching import CapturedGraph
-from cortado.device.threads import Turn, in_turn
+from cortado.device.threads import in_turn
 from cortado.errors import InputError
 from cortado.particles.state import Fields, State, padded
 from cortado.rollout.rollout import Rollout
@@ -72,12 +72,6 @@ class Moment:
     def know(self, values: Arrays) -> None:
         self._values.update(values)
 
-    def adjoint(self, bars: Mapping[str, NDArray]) -> tuple[Arrays, Arrays]:
-        return self.evaluator().adjoint(bars, self)
-
-    def tangents(self, names: list[str], dot: Given, parameters_dot: Given) -> Arrays:
-        return self.evaluator().tangents(names, self, dot, parameters_dot)
-
 
 def _needs_the_step(name: str) -> bool:
     return name in (STRESS, "wall_force") or is_load(name)
@@ -90,7 +84,7 @@ class QuantityEvaluator:
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
         if not isinstance(solver, ParticleSolver):
             raise InputError("The solver of this scene is no ParticleSolver, so that quantities cannot be computed.")
-        self.solver, self.dimension = solver, scene.dimension
+        self.solver, self.turn, self.dimension = solver, solver.turn, scene.dimension
         self.lattice = solver.lattice
         self.solids: tuple[SolidTable, ...] = scene.solid
         self.container: Container = scene.container
@@ -98,10 +92,6 @@ class QuantityEvaluator:
         self._counts: Counts = ()
         self._graphs: dict[tuple[int, Counts], CapturedGraph] = {}
         self._rounds: list[int] = []
-
-    @property
-    def turn(self) -> Turn:
-        return self.solver.turn
 
     def within(self, names: Iterable[str]) -> dict[str, QuantityFormula]:
         return {name: self._formulas[name] for name in self._checked(names)}

@@ -324,7 +324,8 @@ class Measure(OfSimulation):
         moment, row = residual.snapshot.moment, row_of(rollout, parameters.written, 0)
         assert moment is not None
         name = str(self._name)
-        return {READING: moment.tangents([name], fields.numpy(self._simulation.dimension), row)[name]}
+        found = moment.evaluator().tangents([name], moment, fields.numpy(self._simulation.dimension), row)
+        return {READING: found[name]}
 
     def _back(self, look: Look, bar: np.ndarray) -> dict[str, Any]:
         snapshot, rollout = look.snapshot, self._rollout
