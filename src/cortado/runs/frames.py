@@ -65,7 +65,7 @@ class Marks:
         return np.where(one_by_one, self.at(numbers), times)
 
     def chosen(self, times: NDArray[Any], stride: int) -> Marks | None:
-        """Return None if every ``stride``-th frame is not evenly spaced."""
+        """Return None if the chosen frames are not evenly spaced."""
         numbers = self.passed(times)
         apart = np.diff(numbers)
         every = 1 if stride == 1 else int(apart[0]) if len(apart) else 0

@@ -54,7 +54,7 @@ class EverySteps:
         return expected_frames(rollout, self.steps)
 
     def count(self, steps: int, time: float | None) -> int:
-        """Return the number of frames in ``steps`` equal steps over ``time`` [s], or None without a needed time."""
+        """Return the number of frames if ``steps`` equal steps take ``time`` [s]."""
         return 1 + -(-steps // self.steps)
 
 
@@ -102,7 +102,7 @@ class TrajectoryBatch(Sequence[Trajectory]):
 
     trajectories: tuple[Trajectory, ...]
     fields: Mapping[str, NDArray[Any]]
-    """Fields that change, by name, (frames, batch, ...). After the last frame of a lost scene they are NaN."""
+    """Fields that change, by name, (frames, batch, ...). After the last frame of a lost scene the values are NaN."""
     lost: Mapping[int, DivergedError]
     """Errors of the scenes that lost a particle, by scene number."""
 

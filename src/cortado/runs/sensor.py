@@ -157,7 +157,7 @@ class SensorLog:
         self._rows: dict[str, list[NDArray[Any]]] = {name: [] for name in self.sensors}
 
     def read(self, name: str, number: int, reading: Callable[[], NDArray[Any]]) -> None:
-        """Store the reading (k,) of state ``number``, once. It is NaN if the next step loses a particle."""
+        """Store the reading (k,) of state ``number`` once, or NaN if the next step loses a particle."""
         if number == len(self._rows[name]):
             try:
                 self._rows[name].append(reading())
