@@ -1,5 +1,4 @@
-"""The command ``cortado compare``, which compares two runs, or a run with measured data. Also the command ``cortado
-convergence``."""
+"""The commands ``cortado compare``, for two runs or for a run and measured data, and ``cortado convergence``."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,4 @@
-"""The command ``cortado describe``, which describes a scene and the cost of its run. Also the command ``cortado
-gradients check``."""
+"""The commands ``cortado describe``, for a scene and the cost of its run, and ``cortado gradients check``."""
 
 import json
 import math

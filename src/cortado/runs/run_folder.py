@@ -49,11 +49,8 @@ class _Entry:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """The folder and files of one run.
-
-    The file environment.json marks a run folder. The file is written first and removed last, so that the folder of a
-    killed process can be overwritten or resumed.
-    """
+    """The file environment.json marks a run folder. The file is written first and removed last, so that the folder of a
+    killed process can be overwritten or resumed."""
 
     path: Path
     scene = _Entry("scene.json")
@@ -80,9 +77,8 @@ class RunFolder:
         overwrite: bool = False,
     ) -> Self:
         """Make the folder of a new run of the command ``kind``. A resumed run must have the same kind and ``settings``.
-        ``overwrite`` removes the files of an earlier run.
-
-        Raises `InputError` if the folder is not writable, or contains files that the run would replace."""
+        ``overwrite`` removes the files of an earlier run. Raises `InputError` if the folder contains files that the run
+        would replace."""
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
         noted["files"] = {table[key]: _mark(table[key]) for table, key in files_named(json.loads(scene_json))}
