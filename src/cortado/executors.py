@@ -243,7 +243,6 @@ class _Map:
             raise self._executor.deserted(now - self._manned)
 
     def _take(self, future: Future[Any]) -> None:
-        """Store the result of a finished call, or send the function to a worker that does not have it."""
         number, item = self._sent.pop(future)
         try:
             try:

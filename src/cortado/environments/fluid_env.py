@@ -76,11 +76,8 @@ class Twin:
         from cortado.jax import value
         from cortado.optimisation.layers.with_jax import jnp
 
-        def like(numbers: NDArray, u: Any) -> Any:
-            return jnp.asarray(numbers, u.dtype)
-
-        loss = value(self.problem, gradient)
-        return lambda actions: self._loss(loss, jnp.asarray(actions), like, jnp.tensordot)
+        loss, array = value(self.problem, gradient), jnp.asarray
+        return lambda actions: self._loss(loss, array(actions), lambda a, u: array(a, u.dtype), jnp.tensordot)
 
     def in_torch(self, gradient: GradientEstimator | None = None) -> Any:
         """Return the loss as a differentiable function of a PyTorch tensor (actions, a). See `cortado.torch.value`."""

@@ -42,7 +42,6 @@ class BackwardStep(Protocol):
     """True if a CUDA graph may capture the backward step."""
     rollout: "Rollout"
     solver: Solver
-    """Solver that repeats the forward step."""
 
     def begin(self) -> None:
         """Set the adjoints of the parameters to 0."""

@@ -124,17 +124,15 @@ SCALES = (0.6, 1.5)
 def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, courses: dict[str, Changing]) -> str | None:
     """Return a sentence about the first invalid path or scale, or None. ``run`` has values of all steps."""
     spacing, furthest = scene.discretisation.spacing, FURTHEST * scene.discretisation.spacing * (1.0 + 1e-6)
+    left = f"which is further than a spacing, {spacing:g} m: fluid is left behind in it"
     if wrong := _stretched(scene, values):
         return wrong
     for what, moved in moved_by(scene, values, courses).items() if scene.solver.chooses else ():
         travel = Travel.of(scene, values, [moved])
         sizes = travel.at(travel.times + travel.least) - travel.lengths
         if (size := sizes.max()) > furthest:
-            return (
-                f"{what} goes {size:.3g} m in {travel.least:.2g} s, the shortest step there is, at "
-                f"{travel.times[sizes.argmax()]:g} s, which is further than a spacing, {spacing:g} m: fluid is left "
-                "behind in it. Give it more time."
-            )
+            when = f"in {travel.least:.2g} s, the shortest step there is, at {travel.times[sizes.argmax()]:g} s"
+            return f"{what} goes {size:.3g} m {when}, {left}. Give it more time."
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
             continue
@@ -143,11 +141,9 @@ def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, cours
         places = np.concatenate([begun, run[position] + run[displacement_name(table.name)]])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)  # in a batch those of the first scene
         if (size := steps.max(initial=0.0)) > furthest:
-            return (
-                f"the solid {table.name!r} goes {size:.3g} m in step {steps.argmax() + 1} of this run, which is "
-                f"further than a spacing, {spacing:g} m: fluid is left behind in it. A displacement begins near 0, and "
-                f"a run that goes on from a state is given {position} as the first one was."
-            )
+            found = f"the solid {table.name!r} goes {size:.3g} m in step {steps.argmax() + 1} of this run, {left}"
+            later = f"a run that goes on from a state is given {position} as the first one was"
+            return f"{found}. A displacement begins near 0, and {later}."
     return None
 
 
@@ -312,10 +308,8 @@ def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) 
     if (np.abs(measured - 1.0) > room).any() or not (between.all() or len(rest_density) == 1):
         lowest, highest = found.min(), found.max()
         values = f"{lowest:g}" if lowest == highest else f"from {lowest:g} to {highest:g}"
-        raise InputError(
-            f"state reference_density is {values} kg/m3, but must be that of fluid with a rest density of "
-            f"{_listed(tuple(rest_density))} kg/m3, as this run has{ADVICE['rest_density']}."
-        )
+        wanted = f"that of fluid with a rest density of {_listed(tuple(rest_density))} kg/m3, as this run has"
+        raise InputError(f"state reference_density is {values} kg/m3, but must be {wanted}{ADVICE['rest_density']}.")
 
 
 def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
@@ -363,10 +357,8 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         if not scene.container.contains(emitter.particles(spacing), -0.25 * spacing).all():
-            advice = (
-                f"the column that waits in emitter[{index}] is not all inside the container, whose walls press on it. "
-                f"Shorten emitter[{index}].length, or make the container larger."
-            )
+            why = f"the column that waits in emitter[{index}] is not all inside the container, whose walls press on it"
+            advice = f"{why}. Shorten emitter[{index}].length, or make the container larger."
     return f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: {advice}"
 
 
@@ -379,11 +371,9 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
         return None
     step, *member = np.unravel_index(torn.argmax(), torn.shape)
     where = f"step {step + 1}" + "".join(f" of scene {b}" for b in member)
-    return (
-        f"the projection left a divergence of {torn.max():.2g} in {where}, times the step, and more than {TORN:g} in "
-        f"{np.count_nonzero(torn > TORN)} of {torn.size} steps: try a smaller time step, more solver.iterations or a "
-        "solver.tolerance."
-    )
+    many = f"more than {TORN:g} in {np.count_nonzero(torn > TORN)} of {torn.size} steps"
+    advice = "try a smaller time step, more solver.iterations or a solver.tolerance"
+    return f"the projection left a divergence of {torn.max():.2g} in {where}, times the step, and {many}: {advice}."
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:

@@ -52,10 +52,9 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
         bounds = np.minimum(bounds, np.minimum.reduce(list(limits)))
     strongest = stability_limits(scene, values)  # at the strongest scheduled gravity
     if (shortest := min(float(bounds.min()), strongest["gravity"], strongest["depth"])) < least:
-        said = (
-            f"The time step is chosen as {shortest:.3g} s at most, but must be at least {least:g} s in this precision"
-        )
-        raise InputError(f"{said}: increase solver.greatest_time_step, or whatever else limits the time step.")
+        wanted = f"at least {least:g} s in this precision"
+        advice = "increase solver.greatest_time_step, or whatever else limits the time step"
+        raise InputError(f"The time step is chosen as {shortest:.3g} s at most, but must be {wanted}: {advice}.")
     return bounds
 
 

@@ -115,11 +115,9 @@ class AdjointGrowth:
         if growth > MOST_GROWTH and not self._warned:
             self._warned = True
             found = f"by e^{growth:.1f}" if math.isfinite(growth) else "beyond 1e19, whose square overflows,"
-            warn(
-                f"The adjoint of the state has grown {found} over {self._steps} steps, back from "
-                f"{self._ended:.4g} s to {start:.4g} s, so that gradients of earlier steps point anywhere: chain fewer "
-                "steps, or take gradient=cortado.gradients.AdjointViscosity()."
-            )
+            back = f"back from {self._ended:.4g} s to {start:.4g} s, so that gradients of earlier steps point anywhere"
+            advice = "chain fewer steps, or take gradient=cortado.gradients.AdjointViscosity()"
+            warn(f"The adjoint of the state has grown {found} over {self._steps} steps, {back}: {advice}.")
 
 
 def sums_of_squares(*states: State) -> wp.array:
