@@ -117,7 +117,7 @@ def draw_runs(
     if as_film and picture.film_frames == 0:
         raise InputError("--film is given, but picture.film_frames is 0, which is no film: leave out one of them.")
     if len(each) == 1:
-        page, times = run_page(each[0], device), each[0].times
+        page, times = run_page(each[0], device), trajectories[0].due
         place, name = folders[0].figures, "film" if as_film else "picture"
     else:
         names = [folder.path.name for folder in folders]

@@ -77,7 +77,7 @@ class Window:
             self.server.scene.add_line_segments(f"{name}/edges", in_space(np.float32(own_lines(one))), LINES, **THIN)
             if scene.dimension == 3 and not one.is_tank:
                 faces, colour = own_faces(one), tuple(to_srgb(one.colour[None, None])[0, 0].tolist())
-                look = {"color": colour, "opacity": 1.0 - one.transparency, "flat_shading": True}
+                look = {"color": colour, "opacity": 1.0 - one.finish.transparency, "flat_shading": True}
                 mesh = in_space(np.float32(faces.vertices)), faces.corners
                 self.server.scene.add_mesh_simple(f"{name}/faces", *mesh, **look)
 

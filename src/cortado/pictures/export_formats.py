@@ -56,8 +56,7 @@ def _write_series(run: Exported, folder: Path, advance: Advance, ending: str, te
         for part, (of, (name, what)) in enumerate(files.items()):
             if not (folder / name).exists():
                 write_atomically(folder / name, text(what))
-            where = f'timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"'
-            entries.append(f"    <DataSet {where}/>")
+            entries.append(f'    <DataSet timestep="{frame.time!r}" part="{part}" name="{of}" file="{name}"/>')
         advance()
     return entries
 
@@ -181,8 +180,7 @@ class _Writer:
             prim.GetExtentAttr().Set(self._pxr.UsdGeom.PointBased.ComputeExtent(given), code)
         if velocities is not None:
             prim.GetVelocitiesAttr().Set(self._floats(velocities), code)
-        colour = prim.CreateDisplayColorPrimvar(self._pxr.UsdGeom.Tokens.vertex)
-        colour.Set(self._floats(colours), code)
+        prim.CreateDisplayColorPrimvar(self._pxr.UsdGeom.Tokens.vertex).Set(self._floats(colours), code)
 
     def _floats(self, values: np.ndarray) -> Any:
         vt, own = self._pxr.Vt, np.ascontiguousarray(values, dtype=np.float32)
@@ -205,8 +203,7 @@ def _vtp(what: ExportedFrame | Mesh) -> str:
     velocities = {} if what.velocities is None else {"velocity": what.velocities}
     if isinstance(what, ExportedFrame):
         own = {name: in_space(values) if values.ndim == 2 else values for name, values in what.fields.items()}
-        corners = np.arange(len(what.positions))[:, None]
-        data = _polydata(what.positions, corners, "Verts", velocities | colours | own)
+        data = _polydata(what.positions, np.arange(len(what.positions))[:, None], "Verts", velocities | colours | own)
     else:
         data = _polydata(what.points, what.triangles, "Polys", colours | velocities)
         data.GetPointData().SetNormals(_array("normals", what.normals))

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import floor
 from operator import itemgetter
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -79,7 +78,6 @@ class WholeFrames:
 
     @property
     def in_words(self) -> str:
-        """Describe how the frames differ from recorded states, or return an empty text."""
         found = []
         if self.shifts.any():
             most = 1e3 * float(np.abs(self.shifts).max())
@@ -168,7 +166,6 @@ class Exported:
 
     @property
     def in_words(self) -> str:
-        """Describe the difference between the volumes of surface and fluid, or return an empty text for a small one."""
         unlike, time, held, whole = self._held
         if unlike <= 0.05:
             return ""
@@ -294,9 +291,9 @@ def _sixth(a: Points, b: Points, c: Points) -> np.ndarray:
     return np.einsum("tk,tk->t", a, np.cross(b, c)) / 6.0
 
 
-def contained_liquid(stage: Stage, positions: Points, colours: Points, device: Any = "cpu") -> Mesh:
+def contained_liquid(stage: Stage, positions: Points, colours: Points) -> Mesh:
     """Positions (n, 3) [m] and the mesh are in scene axes. Raises `ComputationError` without a surface."""
-    launch, stage = BandLauncher(wp.get_device(device)), replace(stage, solids=())
+    launch, stage = BandLauncher(wp.get_device("cpu")), replace(stage, solids=())
     with WARP:
         own = particles_of(stage, positions, colours, launch)
         fluid = wetting(stage, environment_of(stage), own, launch)

@@ -71,8 +71,6 @@ def _around(frames: Sequence[int], n: int, window: int) -> Around:
 
 
 class FilmedRun:
-    """A `Panel` that draws the states of one run."""
-
     def __init__(self, artist: PlanePainter | SpacePainter, state: Callable[[int], State]):
         self._artist, self._state, self._stills = artist, state, dict[int, Any]()
 
@@ -175,10 +173,6 @@ class ShownRun:
         artist = PlanePainter(stage) if isinstance(stage, PlaneStage) else SpacePainter(stage, device)
         return FilmedRun(artist, lambda k: self._state(k, stage, scale))
 
-    @cached_property
-    def times(self) -> NDArray[np.float64]:
-        return self.trajectory.due
-
     @property
     def fingerprint(self) -> str:
         trajectory, found = self.trajectory, sha256(f"{__version__} {self.scene.to_json()}".encode())
@@ -187,7 +181,7 @@ class ShownRun:
         return found.hexdigest()
 
     def _state(self, k: int, stage: PlaneStage | Stage, scale: Scale | None) -> State:
-        frame = self.trajectory[k].moved(float(self.times[k] - self.trajectory.times[k]))
+        frame = self.trajectory[k].moved(float(self.trajectory.due[k] - self.trajectory.times[k]))
         shown = those(is_out(self.scene, frame.others, self.trajectory.particles))
         colours = colours_of(self.scene, frame.mass_fractions, self.trajectory.particles)
         if scale is not None and self.values is not None:
@@ -199,7 +193,7 @@ class ShownRun:
     @cached_property
     def _motions(self) -> SolidMotions:
         known, motions = self.trajectory.times, SolidMotions.of(self.trajectory.others, self.scene.dimension)
-        return motions.at(self.scene, known, np.arange(len(known)), self.times)
+        return motions.at(self.scene, known, np.arange(len(known)), self.trajectory.due)
 
     def _view(self, k: int, stage: PlaneStage | Stage) -> View | None:
         scene, path = self.scene, (self.scene.picture or Picture()).camera_path
@@ -209,7 +203,7 @@ class ShownRun:
         places |= {name: motion.positions[k] for name, motion in self._motions.items()}
         places = {name: scene.domain.wrapped(place) for name, place in places.items()}
         up = upright(np.asarray(scene.forces.gravity))[1]
-        moment = Moment(k / max(len(self.trajectory) - 1, 1), float(self.times[k]), up, places)
+        moment = Moment(k / max(len(self.trajectory) - 1, 1), float(self.trajectory.due[k]), up, places)
         return path.view(stage.home_around if path.goes_around else stage.home, moment)
 
 

@@ -41,8 +41,7 @@ def style() -> str:
 
 def script() -> str:
     """The script must appear once in a page, after all animations."""
-    source = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
-    return f"<script>\n{source}</script>"
+    return f"<script>\n{Path(__file__).with_suffix('.js').read_text(encoding='utf-8')}</script>"
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = 2_200_000) -> tuple[NDArray[np.intp], int]:
@@ -158,5 +157,4 @@ def container_outline(scene: Scene) -> Points:
     low = circle + np.asarray(container.base)
     high = low + container.height * np.eye(3)[axis]
     rims = [np.stack([rim, np.roll(rim, -1, axis=0)], axis=1) for rim in (low, high)]
-    sides = np.stack([low, high], axis=1)[:: len(angles) // 4]
-    return np.concatenate([*rims, sides])
+    return np.concatenate([*rims, np.stack([low, high], axis=1)[:: len(angles) // 4]])

@@ -56,7 +56,6 @@ class PlaneStage:
     """Lower corner (2,) [m] of the container, or of fluid and solids without a container."""
     upper: Points
     spacing: float
-    """Particle spacing [m]."""
     solids: tuple[ShownSolid, ...] = ()
     seen: tuple[Points, Points] | None = None
     """Lower and upper corner (2,) [m] of the shown region, by default `lower` and `upper`."""
@@ -135,7 +134,7 @@ class PlaneStage:
             outside = paper * (1.0 - np.max(shadows, axis=0) * (1.0 - self._room))[..., None]
             paper = outside + (1.0 - paper) * (0.40 * self._room)[..., None]
         for shown, _ in self._bodies:
-            darker = 0.25 * (1.0 - shown.transparency) * self._below(shown) * self._room
+            darker = 0.25 * (1.0 - shown.finish.transparency) * self._below(shown) * self._room
             paper = paper * (1.0 - darker)[..., None]
         return paper
 
@@ -146,7 +145,7 @@ class PlaneStage:
             cover = self._covered(distance)
             gleaming = 0.12 + (0.7 - 0.12) * shown.finish.reflectivity  # 0.12 of dull solids, 0.7 of mirrors
             light = glossy(np.where(self._room > 0.5, cover, 1.0), shown.colour, self.gloss_width, gleaming)
-            opacity = ((1.0 - shown.transparency) * cover * self._room)[..., None]
+            opacity = ((1.0 - shown.finish.transparency) * cover * self._room)[..., None]
             layers.append((opacity, opacity * light))
         if self.container is not None:
             off = np.stack([x, y]) - (0.5 * (self.lower + self.upper))[:, None, None]
@@ -171,7 +170,7 @@ class PlaneStage:
     @cached_property
     def shown(self) -> Points:
         """Fraction of each pixel (rows, columns) where fluid is drawn. Opaque solids are later drawn over the fluid."""
-        return self.free if any(shown.transparency > 0.0 for shown, _ in self._bodies) else self._room
+        return self.free if any(shown.finish.transparency > 0.0 for shown, _ in self._bodies) else self._room
 
     @cached_property
     def _bodies(self) -> list[tuple[ShownSolid, Points]]:
@@ -211,8 +210,7 @@ class PlaneStage:
         return float((self.upper - self.lower).max())
 
     def _below(self, shown: ShownSolid) -> Points:
-        distance = self._distance(shown, DROPPED * self._size)
-        return 0.5 * (1.0 - np.tanh(distance / (BLUR * self._size)))
+        return 0.5 * (1.0 - np.tanh(self._distance(shown, DROPPED * self._size) / (BLUR * self._size)))
 
     def _walls(self, distance: Points, part: Points | float, colour: Points) -> Layer:
         """``distance`` [m] is the distance of the pixels from the inner side of the walls."""
@@ -258,16 +256,14 @@ class PlanePainter:
             empty = np.zeros(self.stage.pixels[0].shape)
             return empty, np.zeros((*empty.shape, 3))
         distances, _ = cKDTree(wet).query(wet, k=24, distance_upper_bound=reach, workers=usable_cores())
-        own = _weight(distances, reach)
-        strength = np.minimum(1.0 / own.sum(axis=1), 0.8)  # 0.8 for one alone
+        strength = np.minimum(1.0 / _weight(distances, reach).sum(axis=1), 0.8)  # 0.8 for one alone
         corner = wet.min(axis=0) - reach
         counts = np.ceil((wet.max(axis=0) + reach - corner) / cell).astype(int) + 1
         field, tinted = _splat(wet, strength, colours[of], corner, cell, counts, reach)
         x, y = self.stage.pixels
         at = [(x - corner[0]) / cell, (y - corner[1]) / cell]
         level = map_coordinates(field, at, order=3, mode="constant", cval=0.0)
-        slope = np.hypot(*np.gradient(level))
-        cover = np.clip(0.5 + (level - 0.5) / np.maximum(slope, 1e-3), 0.0, 1.0)
+        cover = np.clip(0.5 + (level - 0.5) / np.maximum(np.hypot(*np.gradient(level)), 1e-3), 0.0, 1.0)
         if (colours == colours[0]).all():
             return cover, np.broadcast_to(colours[0], (*cover.shape, 3))
         colour = np.stack([map_coordinates(tinted[k], at, order=1, mode="nearest") for k in range(3)], axis=-1)

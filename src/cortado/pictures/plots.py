@@ -54,7 +54,7 @@ def whole_numbers(axis: Any) -> None:
     axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
 
 
-def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", label: str = "loss") -> Path:
+def loss_curve(losses: ArrayLike, path: str | Path, *, label: str = "loss") -> Path:
     """The axis of losses is logarithmic if any loss is positive."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
@@ -72,7 +72,7 @@ def loss_curve(losses: ArrayLike, path: str | Path, *, title: str = "Loss", labe
             axes.plot(*end, "o", color=PALETTE[0], markersize=7)
             axes.annotate(f"{values[k]:.3g}", end, textcoords="offset points", weight="bold", **place)
         axes.margins(x=0.06, y=0.14)
-        axes.set(title=title, xlabel="evaluation", ylabel=label)
+        axes.set(title="Loss", xlabel="evaluation", ylabel=label)
         whole_numbers(axes.xaxis)
     return Path(path)
 

@@ -101,7 +101,7 @@ def shown_run(
 def film_of(run: ShownRun, path: str | Path, device: Any) -> Film:
     if missing := lacking(run.scene):
         raise InputError(missing)
-    pace = pace_of(run.times, run.scene.picture or Picture(), common_rate([run.trajectory.marks]))
+    pace = pace_of(run.trajectory.due, run.scene.picture or Picture(), common_rate([run.trajectory.marks]))
     return film(Path(as_path("path", path)), run_page(run, device), range(len(run.trajectory)), pace)
 
 
@@ -218,7 +218,6 @@ def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float
 
 
 def readings(found: Mapping[str, Readings], path: str | Path) -> Path:
-    """Plot the readings of sensors over time, with a panel for each unit."""
     lines = dict[str, list[tuple[str, Readings, str]]]()
     for name, own in found.items():
         for column, unit in own.units.items():
@@ -242,7 +241,6 @@ def _over_time(path: str | Path, units: Sequence[str]) -> Iterator[Any]:
 
 
 def beside_measured(found: Mapping[str, Readings], measured: Sequence[MeasuredColumn], path: str | Path) -> Path:
-    """Plot a panel for each measured quantity, with the points, the curve of the sensor and the error."""
     with _over_time(path, [one.unit for one in measured]) as panels:
         for panel, one in zip(panels, measured, strict=True):
             name, _, column = one.name.rpartition(".")

@@ -76,8 +76,7 @@ def film_side_by_side(
     pictured = shown_alike(there, each, settings)
     numbers = [f"run {k}" for k in range(1, len(each) + 1)]
     names = [str(name) for name in runs] if isinstance(runs, Mapping) else labels(there, numbers)
-    values = [coloured_by(scene, run) for scene, run in zip(pictured, each, strict=True)]
-    shown_runs = [ShownRun(*one) for one in zip(pictured, each, values, strict=True)]
+    shown_runs = [ShownRun(scene, run, coloured_by(scene, run)) for scene, run in zip(pictured, each, strict=True)]
     page, times = runs_page(shown_runs, names, device_of(device))
     pace = pace_of(times, pictured[0].picture or Picture(), common_rate(run.marks for run in each))
     return film(Path(as_path("path", path)), page, range(len(times)), pace)
@@ -101,13 +100,13 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
     """Return a page of runs, and the times of its frames [s]. Prepare the scenes with `shown_alike`."""
-    times = common_times([run.times for run in runs])
+    times = common_times([run.trajectory.due for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
     scale = Scale.of(picture.colour, np.concatenate(values)) if values else None
     spare = 0 if scale is None else scale.columns(picture.height)
     stages, across = framed_together([run.stage for run in runs], spare)
-    shown = [ShownFrames(run.times, times) for run in runs]
+    shown = [ShownFrames(run.trajectory.due, times) for run in runs]
     drawn = [run.panel(stage, device, scale) for run, stage in zip(runs, stages, strict=True)]
     panels = [_labelled(*one) for one in zip(drawn, names, shown, strict=True)]
     notes = [note for name, frames in zip(names, shown, strict=True) for note in frames.notes(name)]
@@ -169,7 +168,6 @@ class ShownFrames:
         return (self.times > self.own[0] - near) & (self.times < self.own[-1] + near)
 
     def time_in_words(self, k: int) -> str:
-        """Describe the time of the recorded frame that frame ``k`` of the film shows."""
         interval = interval_of(self.times)
         digits = max(ceil(-log10(interval)), 0) if 0.0 < interval < np.inf else 3
         time = f"{self.own[self.nearest[k]]:.{digits}f} s"

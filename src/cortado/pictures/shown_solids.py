@@ -72,10 +72,6 @@ class ShownSolid:
         return np.array(self.finish.colour)
 
     @property
-    def transparency(self) -> float:
-        return self.finish.transparency
-
-    @property
     def body(self) -> Solid:
         return Placed(self.shape, self.position, self.turn)
 
@@ -227,14 +223,11 @@ def _in_strips(triangles: Points, parents: Numbers, first: int, second: int) -> 
 
 @dataclass(frozen=True)
 class SolidMesh:
-    """A triangle mesh of solids in 3-D. Seen from outside, the corners of a triangle run counterclockwise."""
+    """A triangle mesh of solids. Points, normals and triangles are as in `liquid_surface.Mesh`."""
 
     points: Points
-    """Positions of the vertices (p, 3) [m]."""
     normals: Points
-    """Outward unit normals at the vertices (p, 3)."""
     triangles: Numbers
-    """Indices of the vertices of each triangle (t, 3)."""
     from_edges: Points
     """Distance of each corner (column) from each side (row) of a triangle (t, 3, 3) [m], or `FAR` for smooth edges."""
 
@@ -242,8 +235,7 @@ class SolidMesh:
     def of(cls, faces: Faces, longest: float) -> "SolidMesh":
         flat_points, flat_corners, _ = merged(faces.vertices, faces.corners)
         points, corners, parents = refined(flat_points, flat_corners, longest)
-        across = across_of(points, corners)
-        normals = _normals(corners, across)
+        normals = _normals(corners, across_of(points, corners))
         key = np.column_stack([corners.ravel(), np.rint(normals.reshape(-1, 3) * 1e4).astype(np.int64)])
         _, chosen, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
         sides = flat_points[sides_of(flat_corners).reshape(-1, 3, 2)]

@@ -100,7 +100,6 @@ class Stage:
     picture: Picture
     container: Any
     spacing: float
-    """Particle spacing [m]."""
     transparency: float
     """Fraction of light that passes through a layer of fluid, from `media_of`."""
     media: Points
@@ -178,8 +177,7 @@ class Stage:
         """Return the stage with the solids of ``pose`` and the camera at ``view``. An argument None changes nothing."""
         found = self
         if pose is not None:
-            solids = tuple(one.within(self.frame, self.origin) for one in shown_solids(pose))
-            found = replace(found, solids=solids)
+            found = replace(found, solids=tuple(one.within(self.frame, self.origin) for one in shown_solids(pose)))
         if view is not None:
             eye, look_at = (self.frame @ (place - self.origin) for place in (view.eye, view.look_at))
             found = replace(found, eye=eye, look_at=look_at)
@@ -217,9 +215,7 @@ class Stage:
         """Rotation matrix (3, 3) from picture axes to container axes. Container axis 1 is the axis of a cylinder."""
         if not isinstance(self.container, CylinderContainer):
             return np.eye(3)
-        axis = INDEX_OF_AXIS[self.container.axis]
-        to_second = np.roll(np.eye(3), 1 - axis, axis=0)  # rows: the scene's axes, that of the cylinder second
-        return to_second @ self.frame.T
+        return np.roll(np.eye(3), 1 - INDEX_OF_AXIS[self.container.axis], axis=0) @ self.frame.T
 
     @property
     def glass_ends(self) -> tuple[Points, Points]:

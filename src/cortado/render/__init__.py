@@ -17,13 +17,7 @@ if TYPE_CHECKING:
     from cortado.render.renderer import Renderer as Renderer
 
 _MODULES = ("cameras", "renderer")
-_HOMES = {
-    "Orthographic": "cameras",
-    "Perspective": "cameras",
-    "Renderer": "renderer",
-    "TopView": "cameras",
-    "Volume": "cameras",
-}
+_HOMES = {"Renderer": "renderer", **dict.fromkeys(("Orthographic", "Perspective", "TopView", "Volume"), "cameras")}
 __all__ = sorted([*_MODULES, *_HOMES])
 
 if not TYPE_CHECKING:

@@ -175,12 +175,10 @@ class View(Protocol):
     @property
     def extinction(self) -> float:
         """Extinction coefficient of fluid with coverage 1 [1 / m]."""
-        ...
 
     @property
     def background(self) -> Vector:
         """Background colour (3,), in linear RGB."""
-        ...
 
 
 @public

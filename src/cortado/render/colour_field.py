@@ -259,8 +259,9 @@ class ColourField:
         self._kernel = {"h": support, "per_h": 1.0 / support, "sigma": sigma, "volume": of["volume"]}
         zeros, mix = partial(wp.zeros, device=device), precision.fractions(phases)
         palette = colours_type(precision, phases)
-        vectors = (zeros(particles, dtype=precision.vector) for _ in range(4))
-        self._x, self._x_bar, self._colour, self._colour_bar = vectors
+        self._x, self._x_bar, self._colour, self._colour_bar = (
+            zeros(particles, dtype=precision.vector) for _ in range(4)
+        )
         self._fractions, self._fractions_bar = (zeros(particles, dtype=mix) for _ in range(2))
         self._colours, self._colours_dot = zeros(1, dtype=palette), zeros(1, dtype=palette)
         self._colours_bar = zeros(particles, dtype=palette)

@@ -289,23 +289,29 @@ def room(s: Environment, o: wp.vec3, d: wp.vec3):
 
 
 @wp.func
-def wall_normal(s: Environment, p: wp.vec3):
-    """Return the outward normal of the nearest container wall."""
-    q = s.glass_frame * p
-    n = wp.vec3(0.0)
+def nearest_side(s: Environment, q: wp.vec3, lower: wp.vec3, upper: wp.vec3):
+    """Return axis, side (-1 or 1) and distance of the flat container side nearest to ``q``, in container axes."""
+    axis = wp.int32(0)
+    side = wp.int32(-1)
     best = FAR
     for a in range(3):
         if s.glass == 1 or a == 1:
-            low = wp.abs(q[a] - s.room_lower[a])
-            high = wp.abs(q[a] - s.room_upper[a])
-            if low < best:
-                best = low
-                n = wp.vec3(0.0)
-                n[a] = -1.0
-            if high < best:
-                best = high
-                n = wp.vec3(0.0)
-                n[a] = 1.0
+            low = wp.abs(q[a] - lower[a])
+            high = wp.abs(q[a] - upper[a])
+            if wp.min(low, high) < best:
+                best = wp.min(low, high)
+                axis = a
+                side = wp.where(high < low, 1, -1)
+    return axis, side, best
+
+
+@wp.func
+def wall_normal(s: Environment, p: wp.vec3):
+    """Return the outward normal of the nearest container wall."""
+    q = s.glass_frame * p
+    axis, side, best = nearest_side(s, q, s.room_lower, s.room_upper)
+    n = wp.vec3(0.0)
+    n[axis] = float(side)
     if s.glass == 2:
         x = q[0] - 0.5 * (s.room_lower[0] + s.room_upper[0])
         z = q[2] - 0.5 * (s.room_lower[2] + s.room_upper[2])
@@ -341,9 +347,8 @@ def pane(
     seen = sky(s, wp.vec3(r[0], wp.abs(r[1]), r[2]))
     seen = wp.vec3(wp.min(seen[0], 1.8), wp.min(seen[1], 1.8), wp.min(seen[2], 1.8))
     edge = colour * 0.75 + 0.25 * seen
-    light = behind.light + behind.through * (rim * edge + (1.0 - rim) * reflectance * seen)
     passed = Passed()
-    passed.light = light
+    passed.light = behind.light + behind.through * (rim * edge + (1.0 - rim) * reflectance * seen)
     passed.through = behind.through * (1.0 - rim) * (1.0 - reflectance) * (1.0 - 0.015 * is_pane)
     return passed
 

@@ -27,7 +27,6 @@ from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_o
 
 NEIGHBOURS = 24
 """Number of particles that are averaged for the colour of a surface point."""
-
 ROUND = 10_000
 """Greatest number of spheres drawn with 128 triangles each. More spheres are drawn with 32 triangles each."""
 
@@ -62,12 +61,9 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
     """Make a sphere around each particle at ``positions`` (n, 3) [m] with ``colours`` (n, 3)."""
     corners, triangles = _sphere(2 if len(positions) <= ROUND else 1)
     n, k = len(positions), len(corners)
-    return Mesh(
-        points=(positions[:, None] + 0.5 * spacing * corners).reshape(-1, 3),
-        triangles=(k * np.arange(n)[:, None, None] + triangles).reshape(-1, 3).astype(np.int32),
-        normals=np.tile(corners, (n, 1)),
-        colours=np.repeat(colours, k, axis=0),
-    )
+    points = (positions[:, None] + 0.5 * spacing * corners).reshape(-1, 3)
+    triangles = (k * np.arange(n)[:, None, None] + triangles).reshape(-1, 3).astype(np.int32)
+    return Mesh(points, triangles, np.tile(corners, (n, 1)), np.repeat(colours, k, axis=0))
 
 
 @cache
@@ -108,13 +104,10 @@ FULL = wp.constant(wp.float32(2.84))
 @dataclass(frozen=True)
 class LiquidSurface:
     points: wp.array
-    """Positions of the vertices (p,) as vec3 [m]."""
     triangles: wp.array
-    """Indices of the three vertices of each triangle, in one array (3 t,)."""
+    """Vertices of triangles in one array (3 t,)."""
     normals: wp.array
-    """Outward unit normals at the vertices (p,) as vec3."""
     colours: wp.array
-    """Linear colours of the vertices (p,) as vec3."""
     media: wp.array
     """Scattering and absorption coefficients at the vertices (p,) as vec2 [1/m]."""
     neighbours: wp.array

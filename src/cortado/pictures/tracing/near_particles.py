@@ -60,10 +60,8 @@ class Particles:
             raise ComputationError(f"{counted(astray, 'particle')} cannot be drawn, as their positions are not finite.")
         looks = np.empty((len(places), 5), dtype=np.float32)
         looks[:, :3], looks[:, 3:] = colours, media
-        return cls(
-            wp.array(np.asarray(places, dtype=np.float32), dtype=wp.vec3, device=device),
-            wp.array(looks, dtype=Look, device=device),
-        )
+        own = np.asarray(places, dtype=np.float32)
+        return cls(wp.array(own, dtype=wp.vec3, device=device), wp.array(looks, dtype=Look, device=device))
 
     def __len__(self) -> int:
         return len(self.places)
@@ -128,7 +126,7 @@ class NearParticles:
 
 @wp.func
 def bump(q: wp.float32):
-    """Return a cubic spline that falls from 1 at q = 0 to 0 at q = 1, and is 0 beyond."""
+    """Return a cubic spline that falls from 1 at q = 0 to 0 at q = 1."""
     if q < 0.5:
         return 1.0 - 6.0 * q * q * (1.0 - q)
     r = 1.0 - q

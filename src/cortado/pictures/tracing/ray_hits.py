@@ -17,6 +17,7 @@ from cortado.pictures.tracing.backdrop import (
     at_surface,
     between,
     mirrored,
+    nearest_side,
     open_background,
     open_light,
     pane,
@@ -74,7 +75,6 @@ def reach_solid(s: Environment, o: wp.vec3, d: wp.vec3):
 def meet_solid(s: Environment, o: wp.vec3, d: wp.vec3):
     reached = reach_solid(s, o, d)
     met = SurfaceHit()
-    met.found = False
     met.t = FAR
     if reached.t >= FAR:
         return met
@@ -161,28 +161,15 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 @wp.func
 def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
     """The point ``q`` is in container axes, and ``before`` is the light of nearer layers."""
-    axis = wp.int32(0)
-    best = FAR
-    side = wp.int32(0)
-    for a in range(3):
-        low = wp.abs(q[a] - s.glass_lower[a])
-        high = wp.abs(q[a] - s.glass_upper[a])
-        if low < best:
-            best = low
-            axis = a
-            side = 0
-        if high < best:
-            best = high
-            axis = a
-            side = 1
+    axis, side, _distance = nearest_side(s, q, s.glass_lower, s.glass_upper)
     off = FAR
     for a in range(3):
         if a != axis:
             off = wp.min(off, wp.min(q[a] - s.glass_lower[a], s.glass_upper[a] - q[a]))
     n = wp.vec3(0.0)
     n[axis] = 1.0
-    normal = wp.transpose(s.glass_frame) * n
-    return pane(s, d, normal, rim_of(off, width), s.panes[side, axis], s.edge_colour, before)
+    is_pane = s.panes[wp.max(side, 0), axis]
+    return pane(s, d, wp.transpose(s.glass_frame) * n, rim_of(off, width), is_pane, s.edge_colour, before)
 
 
 @wp.func
@@ -194,8 +181,8 @@ def tube_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before:
     z = 0.5 * (s.glass_lower[2] + s.glass_upper[2])
     n = wp.normalize(wp.vec3(q[0] - x, 0.0, q[2] - z))
     off = wp.min(q[1] - s.glass_lower[1], s.glass_upper[1] - q[1])
-    normal = wp.transpose(s.glass_frame) * n
-    return pane(s, d, normal, rim_of(off, width), 1.0 - wp.float32(s.has_walls), s.edge_colour, before)
+    is_pane = 1.0 - wp.float32(s.has_walls)
+    return pane(s, d, wp.transpose(s.glass_frame) * n, rim_of(off, width), is_pane, s.edge_colour, before)
 
 
 @wp.func
@@ -226,7 +213,6 @@ def glass_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
     def glass(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32):
         """Return the light and the transmission of all glass along a ray, up to the distance ``most`` [m]."""
         passed = Passed()
-        passed.light = wp.vec3(0.0)
         passed.through = 1.0
         if s.glass > 0:
             passed = container_glass(s, o, d, most, spread, passed)
@@ -266,7 +252,6 @@ def at_wall(s: Environment, surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.f
 @wp.func
 def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, normal: wp.vec3):
     met = SurfaceHit()
-    met.found = False
     hit = wp.mesh_query_ray(surface.mesh, p, normal, surface.reach)
     if hit.result and hit.sign < 0.0:
         met = at_surface(surface, t, d, hit.face, hit.u, hit.v)
@@ -277,7 +262,6 @@ def behind_wall(surface: LitSurface, p: wp.vec3, d: wp.vec3, t: wp.float32, norm
 @wp.func
 def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
     met = SurfaceHit()
-    met.found = False
     met.t = FAR
     if part[0] <= 0.0:
         hit = wp.mesh_query_ray(surface.mesh, o, d, part[1])
@@ -303,7 +287,6 @@ def into_fluid(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part
 @wp.func
 def into_fluid_among_clear(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3, part: wp.vec2):
     met = SurfaceHit()
-    met.found = False
     met.t = FAR
     start = wp.max(part[0], 0.0)
     beside_container = part[0] > 0.0
@@ -345,7 +328,6 @@ def surface_functions(has_opaque: bool, has_clear: bool) -> tuple[Any, Any]:
     def meet(s: Environment, surface: LitSurface, o: wp.vec3, d: wp.vec3):
         """Find where a ray enters the fluid."""
         met = SurfaceHit()
-        met.found = False
         met.t = FAR
         part = room(s, o, d)
         if part[1] <= wp.max(part[0], 0.0):

@@ -30,8 +30,6 @@ KEY, AROUND = 0.022, 0.05
 CLOSE = 0.15
 """Greatest height of objects that shade the floor from the sky, relative to the size of the contents."""
 SKY = 0.32
-
-
 Soften = Callable[[wp.array], wp.array]
 
 
@@ -62,11 +60,7 @@ FINE, FINE_OWN = 0.03, 0.05
 """Greatest width of the faces of round solids, relative to the contents and relative to the solid."""
 LONGEST = 0.04
 """Greatest side of a triangle at whose corners light is computed, as a fraction of `Stage.size`."""
-
-
 MODULE = kernel_module("shadow")
-
-
 typed = TypesByName(
     wp.float32,
     {
@@ -142,8 +136,6 @@ def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
 
 
 class FloorShadow:
-    """The fraction of light that reaches each floor node."""
-
     def __init__(self, stage: Stage, launch: BandLauncher):
         middle = 0.5 * (stage.lower + stage.upper)
         self._stage, self._launch, self._device = stage, launch, launch.device
@@ -169,7 +161,7 @@ class FloorShadow:
         middle, area = middle[casts], 0.5 * np.cross(b - a, c - a)[casts]
         volumes = 3.0 * stage.spacing * np.abs(np.stack([area @ stage.sun / stage.sun[1], area[:, 1]]))
         parts = Particles.on(self._device, middle, np.tile(shown.colour, (len(middle), 1)))
-        self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.transparency, 0.0)
+        self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.finish.transparency, 0.0)
 
     def _add(self, parts: Particles, volumes: list[wp.array], least: float, opacity: float, tinted: float) -> None:
         """``volumes`` (n,) [m3] are for lamp and sky. ``least`` [m] is the smallest width of the blur."""
@@ -220,7 +212,8 @@ class SolidSurfaces:
         for one in stage.solids:  # relative to its middle; that of a tank is of its cavity
             own = float(np.ptp(one.shape.extent(), axis=0).max())
             faces = one.shape.shown_faces(min(FINE * stage.size, FINE_OWN * own))
-            longest = np.inf if one.transparency == 1.0 else LONGEST * stage.size  # what is clear has no own light
+            is_clear = one.finish.transparency == 1.0  # and has no own light
+            longest = np.inf if is_clear else LONGEST * stage.size
             self._own[one.name] = SolidMesh.of(faces.reversed() if one.is_tank else faces, longest)
 
     @property
@@ -248,7 +241,8 @@ class SolidSurfaces:
             lit[k] = surfaces[-1].lit
             if is_clear:
                 found.clear, found.has_tank = lit[k].mesh, int(any(one.is_tank for one, _ in own))
-                left = [(1.0, one.transparency) if one.is_tank else (one.transparency**0.5,) * 2 for one, _ in own]
+                kept = [(one.finish.transparency, one.is_tank) for one, _ in own]
+                left = [(1.0, part) if is_tank else (part**0.5, part**0.5) for part, is_tank in kept]
                 passed = np.repeat(left, counts, axis=0)  # of light, at a surface from inside and from outside
                 lit[k].left = wp.array(passed, dtype=wp.vec2, device=self._device)
                 lit[k].from_edges = wp.array(mesh.from_edges, dtype=wp.mat33, device=self._device)
@@ -267,4 +261,4 @@ class SolidSurfaces:
 
 
 def _is_clear(shown: ShownSolid) -> bool:
-    return shown.is_tank or shown.transparency > 0.0
+    return shown.is_tank or shown.finish.transparency > 0.0

@@ -261,9 +261,8 @@ class SpacePainter:
     def __init__(self, stage: Stage, device: Any = "cpu"):
         self.stage, self.device = stage, wp.get_device(device)
         self._launch = BandLauncher(self.device)
-        self._solids = SolidSurfaces(stage, self.device) if stage.solids else None
-        kinds = self._solids.kinds if self._solids is not None else (False, False)
-        self._trace, self._illuminates = trace_kernel(*kinds), illuminate_kernel(*kinds)
+        self._solids = SolidSurfaces(stage, self.device)
+        self._trace, self._illuminates = trace_kernel(*self._solids.kinds), illuminate_kernel(*self._solids.kinds)
         shading = self._trace, self._illuminates
         self._kernels = *shading, find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
         """Kernels of a picture, listed so that their modules compile in parallel."""
@@ -293,8 +292,7 @@ class SpacePainter:
 
     def steady_image(self, state: State, own: Any, before: Sequence[Any], after: Sequence[Any]) -> Points:
         with WARP:
-            steady = steadied(own, before, after, self.stage.spacing, self._launch)
-            return self._rays(*self.scenery(state, steady))
+            return self._rays(*self.scenery(state, steadied(own, before, after, self.stage.spacing, self._launch)))
 
     def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
         """A `Still` in ``steady`` provides an averaged surface and an averaged shadow."""
@@ -329,12 +327,11 @@ class SpacePainter:
         return surface
 
     def _rays(self, stage: Stage, s: Any, seen: DeviceSurface, shadow: FloorShadow) -> Points:
-        picture, solids = stage.picture, list[DeviceSurface]()
+        picture = stage.picture
         seen.lit.reach = 2.0 * self.stage.spacing
         seen.lit.is_flat = int(not picture.shaded)
-        if self._solids is not None:
-            self._solids.cast(shadow, stage.solids)
-            s.solids, solids = self._solids.on_device(stage.solids)
+        self._solids.cast(shadow, stage.solids)
+        s.solids, solids = self._solids.on_device(stage.solids)
         given = {"s": s, "surface": seen.lit}
         self._illuminate(seen, self._lamps, given)
         for one in solids:

@@ -10,6 +10,7 @@ import warp as wp
 
 from cortado.device.launching import BandLauncher
 from cortado.device.precision import TypesByName
+from cortado.pictures.tracing.backdrop import smooth_step
 from cortado.pictures.tracing.near_particles import (
     MODULE,
     Floats,
@@ -27,7 +28,7 @@ WINDOW, SHADOW_WINDOW = 30, 6
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
 """Pairs of limits for the displacement [spacings], the change of density and the change of light. Below the first limit
 a frame has full weight. Above the second limit its weight is 0."""
-BODY_REACH, BODY = 6.0, (7.0, 12.0)
+BODY_REACH, BODY = 6.0, wp.constant(wp.vec2(7.0, 12.0))
 """Distance for counting particles around a block [spacings], and the counts for a drop and for bulk fluid."""
 TOUCHING = wp.constant(27)
 
@@ -45,13 +46,6 @@ class Still:
     """Measure of each block's fluid, from 0 for drops to 1 for bulk fluid (blocks,)."""
     light: Vec3s2d
     """Light at each node of the floor (nodes, nodes)."""
-
-
-@wp.func
-def share(way: wp.float32, limits: wp.vec2):
-    """Return a weight that falls smoothly from 1 at the first limit to 0 at the second limit."""
-    x = wp.clamp((limits[1] - way) / (limits[1] - limits[0]), 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 @wp.func
@@ -87,7 +81,7 @@ def find_means(first, own, s, reach, means, bodies):
     means[n] = total / float(CUBES)
     at = wp.float32(WIDTH) * (wp.vec3(block_at(own.b, own.blocks[n])) + wp.vec3(0.5))
     near = count_near(s, place_of(own.b, at[0], at[1], at[2]), reach)
-    bodies[n] = 1.0 - share(near, wp.static(wp.vec2(*BODY)))
+    bodies[n] = 1.0 - smooth_step(BODY[1], BODY[0], near)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -129,7 +123,7 @@ def find_shares(first, touching, ways, bodies, before, window, limits, shares):
                     weight = 1.0 / float(1 << off)
                     total += weight * ways[m, j] * ways[m, j]
                     weights += weight
-            left *= share(wp.max(wp.sqrt(total / weights), ways[n, j]), limits)
+            left *= smooth_step(limits[1], limits[0], wp.max(wp.sqrt(total / weights), ways[n, j]))
         shares[n, j] = left * nearness(j, before, window)
 
 
@@ -147,7 +141,7 @@ def average_level(first, own, others, before, limits, indices, shares, levels):
             left = 1.0
         if left > 0.0 and shares[n, j] > 0.0 and indices[n, j] >= 0:
             change = others[j].b.levels[indices[n, j], k] - level
-            left *= share(wp.abs(change), limits)
+            left *= smooth_step(limits[1], limits[0], wp.abs(change))
             total += left * shares[n, j] * change
             weights += left * shares[n, j]
     levels[n, k] = level + total / weights
@@ -167,7 +161,7 @@ def average_light(first, own, others, before, window, limits, found):
             left = 1.0
         if left > 0.0 and wp.min(light) < 1.0:
             change = others[j].light[i, k] - light
-            left *= share(wp.max(wp.abs(change)), limits)
+            left *= smooth_step(limits[1], limits[0], wp.max(wp.abs(change)))
             weight = left * wp.max(nearness(j, before, window), 0.0)
             total += weight * change
             weights += weight

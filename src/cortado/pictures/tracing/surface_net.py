@@ -27,8 +27,6 @@ WIDTH = wp.constant(4)
 CUBES = wp.constant(64)
 LEVEL = wp.constant(wp.float32(0.6))
 """Density at the isosurface. The density inside fluid is about 1."""
-
-
 ROUNDS_OF_NORMALS = 15
 Neighbours = wp.types.vector(6, wp.int32)
 """Indices of the net corners in the six adjacent cubes, or -1 for a cube without a net corner."""
@@ -381,16 +379,14 @@ def smoothed(values: wp.array, neighbours: wp.array, weights: wp.array, rounds: 
 def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
     """Return outward unit normals (p,) at net corners with the positions ``points`` (p,)."""
     normals, other = wp.empty_like(points), wp.empty_like(points)
-    own = {"signs": net.signs, "neighbours": net.neighbours}
-    launch(find_normals, len(points), **own, points=points, normals=normals)
+    launch(find_normals, len(points), signs=net.signs, neighbours=net.neighbours, points=points, normals=normals)
     return launch.to_and_fro(smooth_normals, ROUNDS_OF_NORMALS, normals, other, neighbours=net.neighbours)
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
     """Return indices of net corners (3 t,), three for each triangle."""
     found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
-    given = {"cubes": net.cubes, "signs": net.cube_signs, "points": points}
-    launch(list_triangles, len(net.cube_signs), **given, triangles=found)
+    launch(list_triangles, len(net.cube_signs), cubes=net.cubes, signs=net.cube_signs, points=points, triangles=found)
     return found
 
 

@@ -1,9 +1,5 @@
 """A ray tracer for a fluid surface that reflects, refracts, absorbs and scatters light.
 
-First, `illuminate_kernel` computes the light on surfaces. Then rays are traced from the camera. At the fluid a ray is
-split by Fresnel's law. The reflected ray continues to the surroundings or to the fluid. The refracted ray passes
-through the fluid and leaves it again, up to ``segments`` times.
-
 Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light is scattered light. Scattered light has
 the fluid's colour and the brightness of the light on the fluid's surface. The remaining light is multiplied by
 colour^(absorption L), by the Beer-Lambert law. The optical properties at the entry point are used along the whole ray.
