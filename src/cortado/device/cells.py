@@ -74,8 +74,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
         furthest = real(wp.static(FURTHEST))
         return not (wp.abs(s[0]) < furthest and wp.abs(s[1]) < furthest and wp.abs(s[2]) < furthest)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def count(grid, particles: int, x, counts, arrivals):
         """``counts`` must be 0 before the launch."""
         i = wp.tid()
@@ -88,8 +87,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
         cell = member * cells + cell
         arrivals[i] = wp.vec2i(cell, wp.atomic_add(counts, cell, 1))
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def place(arrivals, starts, counts, placed, before):
         """``counts`` is reset to 0 for the next sort."""
         i = wp.tid()
@@ -99,8 +97,7 @@ def cell_kernels(precision: Precision) -> SimpleNamespace:
         before[p] = arrival[1]
         counts[arrival[0]] = 0
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def rank(placed, before, order):
         p = wp.tid()
         i = placed[p]

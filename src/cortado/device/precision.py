@@ -198,8 +198,7 @@ COUNTS = (1, 2, 4, 8, 16)
 
 def checked_lanes(lanes: Any) -> int | None:
     if lanes is not None and whole_number("lanes", lanes, 1) not in COUNTS:
-        wanted = ", ".join(map(str, COUNTS))
-        raise InputError(f"lanes is {shown(lanes)}, but must be one of {wanted}, or be left out.")
+        raise InputError(f"lanes is {shown(lanes)}, but must be one of {', '.join(map(str, COUNTS))}, or be left out.")
     return None if lanes is None else int(lanes)
 
 

@@ -111,9 +111,7 @@ def _kernel(name: str, module_name: str, function: Any, **options: Any) -> Any:
 
 @cache
 def add_kernel(dtype: Any) -> Any:
-    module = kernel_module(f"add_{type_name(dtype)}")
-
-    @wp.kernel(module=module, enable_backward=False)
+    @wp.kernel(module=kernel_module(f"add_{type_name(dtype)}"), enable_backward=False)
     def accumulate(value: wp.array(dtype=dtype), total: wp.array(dtype=dtype)):
         i = wp.tid()
         total[i] = total[i] + value[i]

@@ -100,8 +100,7 @@ class TriangleTree:
             pairs = pairs[_near(self.boxes[pairs[:, 0]], other.boxes[pairs[:, 1]], reach)]
         found = [np.zeros((0, 2), dtype=np.int64)]
         for one, two in pairs - leaves:
-            ends = self.starts[one : one + 2], other.starts[two : two + 2]
-            found.append(grid([np.arange(*end) for end in ends]))
+            found.append(grid([np.arange(*self.starts[one : one + 2]), np.arange(*other.starts[two : two + 2])]))
         pairs = np.concatenate(found)
         first, second = (np.hstack([tree.corners.min(axis=1), tree.corners.max(axis=1)]) for tree in (self, other))
         pairs = pairs[_near(first[pairs[:, 0]], second[pairs[:, 1]], reach)]

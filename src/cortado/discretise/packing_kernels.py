@@ -86,8 +86,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
     whole = "starts counts others ends listed"
     typed = TypesByName(real, {**structs, wp.bool: "free blind", wp.int32: whole, vector: "x moves"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def look_around(
         first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
@@ -116,8 +115,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
         counts[i] = count
         sums[i] = total
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
         """Pairs with a free particle are added to ``equations``, and to ``distances`` if closer than ``close`` [m]."""
         i = wp.tid()
@@ -154,8 +152,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
         equations.starts[i + 1] = place
         equations.close_starts[i + 1] = close_place
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def multiply(equations, moves, changes, approaches):
         i = wp.tid()
         move = moves[i]
@@ -169,8 +166,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
         for k in range(equations.close_starts[i], equations.close_starts[i + 1]):
             approaches[k] = wp.dot(equations.directions[k], move - moves[equations.close_others[k]])
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module)
     def multiply_back(equations, changes, approaches, moves):
         """Add the vector-Jacobian product of the equations to ``moves``."""
         i = wp.tid()

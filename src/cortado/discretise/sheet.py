@@ -137,8 +137,7 @@ class Thickened(Solid):
             starts = [a for a in sheet.corners[:, 0] if uses[a] == 1]
             ends = [b for b in sheet.corners[:, 1] if uses[b] == 1]
             strips = [(a + count, a) for a in starts] + [(b, b + count) for b in ends]
-            joined = np.array(strips, dtype=np.int64).reshape(-1, 2)
-            return Faces(vertices, np.concatenate([*both, joined])[:, ::-1])
+            return Faces(vertices, np.concatenate([*both, np.array(strips, dtype=np.int64).reshape(-1, 2)])[:, ::-1])
         sides = np.concatenate([sheet.corners[:, [k, (k + 1) % 3]] for k in range(3)])
         _, first, uses = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
         a, b = sides[first[uses == 1]].T

@@ -75,8 +75,7 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
         total = np.bincount(owner, areas, len(chosen))
         sums = np.stack([np.bincount(owner, areas * x, len(chosen)) for x in candidates.T], axis=1)
         chosen = sums[total > 0.0] / total[total > 0.0, None]
-    moved = np.unique(_nearest(candidates, chosen)[1])
-    kept = _chosen(candidates, moved, LEAST_APART * spacing, nothing)
+    kept = _chosen(candidates, np.unique(_nearest(candidates, chosen)[1]), LEAST_APART * spacing, nothing)
     chosen = candidates[np.sort(_chosen(candidates, order, APART * spacing, kept))]
     sizes = np.bincount(_nearest(chosen, candidates)[1], areas, len(chosen))
     return SurfacePoints(chosen, sizes / spacing ** (dimension - 1))

@@ -67,8 +67,7 @@ def nearest_of_triangle(p: vector, a: vector, b: vector, c: vector) -> vector:
     return a + (vb / (va + vb + vc)) * ab + (vc / (va + vb + vc)) * ac
 
 
-@wp.kernel(module=_module, enable_backward=False)
-@typed.arrays
+@typed.kernel(_module)
 def find_nearest(first: int, points, boxes, starts, corners, leaves: int, reach: real, nearest, squares):
     """If no triangle is within the distance ``reach``, the given point itself is stored."""
     i = first + wp.tid()
@@ -146,8 +145,7 @@ def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
     return around
 
 
-@wp.kernel(module=_module, enable_backward=False)
-@typed.arrays
+@typed.kernel(_module)
 def find_windings(first: int, points, boxes, starts, corners, leaves: int, windings):
     """The winding number is 1 inside a surface with outward normals."""
     i = first + wp.tid()
@@ -210,8 +208,7 @@ def some_edge_pierces(
     return found
 
 
-@wp.kernel(module=_module, enable_backward=False)
-@typed.arrays
+@typed.kernel(_module)
 def find_crossings(
     first: int, points, boxes, starts, corners, leaves: int, names, tolerance: real, places, counts, others
 ):
@@ -349,8 +346,7 @@ def find_crossing(precision: Precision = FLOAT64) -> Any:
     goes_through, vector = face_functions(precision)[2], precision.vector
     typed = TypesByName(wp.bool, {faces_type(precision): "faces", vector: "starts ends"})
 
-    @wp.kernel(module=kernel_module(f"sheet_crossings_{precision.name}"), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(kernel_module(f"sheet_crossings_{precision.name}"))
     def find(first: int, faces, starts, ends, found):
         i = first + wp.tid()
         found[i] = goes_through(starts[i] - faces.middles[0], ends[i] - faces.middles[0], 0, faces)

@@ -95,8 +95,7 @@ def cup_places(radius: float, height: float, lid: bool, spacing: float, reach: f
     closed = levels if lid else levels[levels < height - reach]
     ends = closed[np.minimum(closed, height - closed) < reach] if lid else closed[closed < reach]
     radii = radius - spacing * (np.arange(max(int(np.ceil(reach / spacing)), 1)) + 0.5)
-    rings = [ring(value, spacing) for value in radii[radii > 0.0]]
-    side = stacked(np.concatenate([np.zeros((0, 2)), *rings]), closed)
+    side = stacked(np.concatenate([np.zeros((0, 2)), *(ring(r, spacing) for r in radii[radii > 0.0])]), closed)
     outward = np.pad(side[:, :2] / np.linalg.norm(side[:, :2], axis=1, keepdims=True), ((0, 0), (0, 1)))
     up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), side.shape)
     middle = disc(radius, spacing, 2)

@@ -11,6 +11,7 @@ dimensions, because the area grows.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import warp as wp
 from cortado.device.cells import CellSort, cell_grid_type
 from cortado.device.grid import Grid
 from cortado.device.launching import bundle, launch
-from cortado.device.modules import kernel_module
+from cortado.device.modules import by_name, kernel_module
 from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.discretise.shapes import Rows
 from cortado.particles.state import Layout, zeros
@@ -86,7 +87,7 @@ def sizes_type(precision: Precision) -> Any:
 
 
 @cache
-def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
+def _kernels(precision: Precision) -> SimpleNamespace:
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     module = kernel_module(f"moving_walls_{precision.name}")
     vectors = {f"wall_{name}": vector for name in ("positions", "feet", "velocities")}
@@ -168,7 +169,7 @@ def _kernels(precision: Precision) -> tuple[Any, Any, Any, Any]:
         walls.wall_turns_dot[first + p] = turned
         walls.wall_growths_dot[first + p] = sizes.power * growth
 
-    return place, write, shift, write_tangent
+    return by_name(place, write, shift, write_tangent)
 
 
 class MovingWalls:
@@ -206,15 +207,14 @@ class MovingWalls:
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
         """Write the wall particles to the arrays of a neighbour search, for a ``time_step`` (members,) [s]."""
-        place, write, shift, _ = self._kernels
-        launch(place, self._all, self._device, self._own, self.named)
+        launch(self._kernels.place, self._all, self._device, self._own, self.named)
         self._sort(self._own["x"])
         starts, shifted = self._sort.grid.starts, self.grid.starts
-        launch(shift, starts.size, self._device, first=self._first, starts=starts, shifted=shifted)
+        launch(self._kernels.shift, starts.size, self._device, first=self._first, starts=starts, shifted=shifted)
         known = {"first": self._first, "order": self._sort.order, "time_step": time_step}
-        launch(write, self._all, self._device, self._own, self.named, known, walls)
+        launch(self._kernels.write, self._all, self._device, self._own, self.named, known, walls)
 
     def write_tangent(self, time_step: wp.array, time_step_dot: wp.array, walls: Mapping[str, wp.array]) -> None:
         known = {"first": self._first, "order": self._sort.order}
         known |= {"time_step": time_step, "time_step_dot": time_step_dot}
-        launch(self._kernels[3], self._all, self._device, self._own, known, self.named, walls)
+        launch(self._kernels.write_tangent, self._all, self._device, self._own, known, self.named, walls)

@@ -155,8 +155,7 @@ def over_fluid(
     """Return the text of a loop over fluid neighbours that reads ``arrays``, and by default adds up the term. With
     ``ahead``, the loop loads the values of `UNROLL` neighbours before it uses any of these values."""
     arrays, body = arrays or term.of_neighbours, body or _adding_up(term)
-    kinds = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"}
-    loads = kinds if ahead else {}
+    loads = {d.precision.vector: "_vectors", d.precision.real: "_numbers", d.precision.six: "_sixes"} if ahead else {}
     loaded = {array: loads[kind] for array, kind in arrays.items() if kind in loads}
     of_j = {array: f"_{array}_j[_more]" if array in loaded else f"{array}[_j]" for array in arrays}
     return OVER_FLUID.format(

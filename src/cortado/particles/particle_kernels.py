@@ -126,8 +126,7 @@ def sum_kernel(
         arguments.entry(number, total.discretisation.precision.real)
     values = (f"{times} * _total_{n}" if times else f"_total_{n}" for n in range(len(total.results)))
     values = (f"{value} / {per}" if per else value for value in values)
-    writes = zip(arrays.split(), values, total.results, strict=True)
-    return arguments.kernel(f"{MADE}{name}", [], writes, {}, module)
+    return arguments.kernel(f"{MADE}{name}", [], zip(arrays.split(), values, total.results, strict=True), {}, module)
 
 
 def sum_kernels(
