@@ -1,19 +1,9 @@
-"""One pressure iteration of PCISPH (Solenthaler and Pajarola 2009):
+"""One pressure iteration of PCISPH (Solenthaler and Pajarola 2009). `docs/discretisation.md` has the equations.
 
-    p_i  = max(p_i + delta y_i (m_i n*_i - rho_0i), 0),   delta = k / dt^2
-    c_i  = p_i / n_i^2
-    ap_i = -(V / m_i) (sum_j (c_i + c_j) G_ij + sum_b w_b c_i G_ib)
-    v*_i = v_i + dt (a_i + ap_i),   x*_i = x_i + dt v*_i
-
-Particle i has the pressure p, the mass m, the rest density rho_0 and the explicit acceleration a. All particles have
-the volume V, and k is the stiffness. n is the number density (`cortado.sph.density`; for fluids of different masses:
-Solenthaler and Pajarola 2008). y is the relaxation beside walls (`cortado.solvers.pcisph.solver`), and w_b the weight
-of wall particle b. The kernel gradients G are taken at the positions x(t). The predicted number density n* is computed
-at the predicted positions x*, with the neighbour lists of x(t).
-
-The force, including the force of walls, is the transpose of the derivative of n with respect to positions. Moving
-particles against the force therefore takes the work V sum_i c_i dn_i. After the last iteration (x*, v*) is the new
-state. The maximum with 0 prevents suction at a free surface. The derivative of the maximum is 1 for p > 0, else 0.
+All kernel gradients are taken at the positions x(t), and all neighbour lists are of x(t). The force, including the
+force of walls, is the transpose of the derivative of the number density n with respect to positions. Moving particles
+against the force therefore takes the work V sum_i c_i dn_i with c = p / n^2. The derivative of max(p, 0) is 1 for p >
+0, else 0.
 """
 
 from functools import cache

@@ -1,26 +1,16 @@
 """Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009): steps, their tangent and adjoint, and two
-factors on the pressure correction delta of an iteration.
+factors on the pressure correction of an iteration. `docs/discretisation.md` has the equations.
 
-*Density ratios*: The formula for delta assumes particles of equal mass. A pressure moves lighter neighbours further, in
-proportion to the ratio of the masses. The iteration diverges if a density changes by more than twice the wanted amount.
-delta is therefore multiplied by the density-ratio relaxation
+*Density ratios*: The pressure correction assumes particles of equal mass, but a pressure moves lighter neighbours
+further. The iteration diverges if a density changes by more than twice the wanted amount. The density-ratio relaxation
+is 1 among particles of equal or greater mass, and tends to 1 / (1 + t / 2), the value for a lattice, for large t.
 
-    1 / (1 + e(t_i)),   t_i = V sum_j W_ij (m_i / m_j - 1),   e(t) = t^2 / (2 (t + a)) for t > 0, else 0.
-
-The relaxation of a particle is 1 among particles of equal or greater mass. For large t the relaxation tends to 1 / (1 +
-t / 2), the value for a lattice. The constant a makes e smooth at t = 0.
-
-*Walls*: The formula for delta assumes a particle with a filled neighbourhood. Beside a wall, the same pressure changes
-the density of particle i more, by |S_i|^2 / (2 sum_j G_j . G_j). Here S_i = sum_b w_b G_ib is a sum over wall particles
-b, and G_j are the kernel gradients on a lattice. A change of more than twice the wanted amount overshoots and pushes
-the particle away. A particle that approaches a wall meets a steeper gradient than at the start of the step.
-The change by walls is therefore doubled. delta is multiplied by the wall relaxation
-
-    y_i = 1 / (1 + |S_i|^2 / response),   response = sum_j G_j . G_j.
-
-The wall relaxation is smooth, and 1 away from walls. The relaxation changes the rate of convergence, not the limit.
-Sums are multiplied by response^(-1/2) before they are squared, because the square of a gradient overflows in float32
-for small spacings.
+*Walls*: The pressure correction assumes a particle with a filled neighbourhood. Beside a wall, the same pressure
+changes the density of particle i more, by |S_i|^2 / (2 R). Here S_i = sum_b w_b G_ib is a sum over wall particles b,
+and R = sum_j G_j . G_j is over the kernel gradients on a lattice. A particle that approaches a wall meets a steeper
+gradient than at the start of the step. The wall relaxation 1 / (1 + |S_i|^2 / R) therefore doubles the change by walls.
+The wall relaxation changes the rate of convergence, not the limit. Sums are multiplied by R^(-1/2) before they are
+squared, because the square of a gradient overflows in float32 for small spacings.
 """
 
 from collections.abc import Sequence

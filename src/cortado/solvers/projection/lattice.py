@@ -58,7 +58,7 @@ def endless(discrete: DiscreteScene) -> bool:
 
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
-    """Along each axis the grid has 4 to 7 times a power of two nodes, so that coarser levels can halve the number.
+    """The number of nodes along each axis is 4 to 7 times a power of two, so that coarser levels can halve the number.
     Nodes lie on the lower walls of a container."""
     reach, most = SPACING * scene.discretisation.spacing, max(4 * particles, 512)
     grid = Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)
