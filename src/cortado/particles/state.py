@@ -138,8 +138,12 @@ class Arrays(Staying):
         return type(self)({name: array.grad for name, array in self._arrays.items()})
 
     def clear(self) -> None:
-        for array in self.arrays():
-            array.zero_()
+        clear(self.arrays())
+
+
+def clear(arrays: Iterable[wp.array]) -> None:
+    for array in arrays:
+        array.zero_()
 
 
 def zeros(kinds: Mapping[str, tuple[Any, Any]], device: Any, requires_grad: bool = False) -> dict[str, wp.array]:

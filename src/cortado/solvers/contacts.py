@@ -44,7 +44,7 @@ from cortado.device.reduction import add, sum_of
 from cortado.discretise.shapes import Points
 from cortado.particles.moving_walls import resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.particles.state import Layout, Parameters, padded, zeros
+from cortado.particles.state import Layout, Parameters, clear, padded, zeros
 from cortado.scene.motions import RESTITUTION, friction_name, restitution_name
 from cortado.solvers.obstacles import Obstacle, middle_of, obstacle_mesh
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
@@ -277,10 +277,9 @@ class Contacts:
         self._period, self._axes = map(layout.precision.vector_of, (periods, np.ones_like(periods)))
         self._shares = [Totals(contact, share_kinds(layout)) for contact in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
-        unsaid = {"friction": 0.0, "restitution": RESTITUTION}
         self._unsaid: Arrays = {}
         """Default coefficients of friction and restitution."""
-        for label, value in unsaid.items():
+        for label, value in (("friction", 0.0), ("restitution", RESTITUTION)):
             for name, number in ((label, value), (f"{label}_dot", 0.0), (f"{label}_bar", 0.0)):
                 self._unsaid[name] = wp.full(layout.members, number, layout.precision.real, layout.device)
         self.lifts = lift_kernels(layout.precision)
@@ -314,8 +313,7 @@ class Contacts:
     def look(self, step: StepContext) -> None:
         step.launch(self.lifts.forward, self.lift, threads=self.layout.members)
         for number, (contact, shares) in enumerate(zip(self.contacts, self._shares, strict=True)):
-            for array in contact.found.values():
-                array.zero_()
+            clear(contact.found.values())
             for place in contact.places:
                 step.launch(self.kernels.look, place, *self.known(step, number), threads=contact.all)
             step.launch(self.kernels.push.forward, shares.each, *self.known(step, number), threads=contact.all)
@@ -354,7 +352,7 @@ class ContactsAdjoint:
     def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
         self._contacts, self._changes, layout = contacts, changes, contacts.layout
         vectors = [*OWN, *(f"other_{name}" for name in OWN), "lift"]
-        kinds = {**dict.fromkeys(vectors, layout.precision.vector)}
+        kinds = dict.fromkeys(vectors, layout.precision.vector)
         kinds |= dict.fromkeys(("other_scales", *NUMBERS), layout.precision.real)
         self._moved = [Totals(contact, kinds, "_bar", end="") for contact in contacts.contacts]
         sums = {f"{name}_sum_bar": (layout.members, kind) for name, kind in share_kinds(layout).items()}

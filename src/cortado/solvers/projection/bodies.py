@@ -36,7 +36,7 @@ from cortado.device.reduction import add
 from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import solid_sum
 from cortado.particles.particle_kernels import over, particle_kernel, pointwise_kernels
-from cortado.particles.state import Layout, zeros
+from cortado.particles.state import Layout, clear, zeros
 from cortado.solvers.projection.joints import Joints, JointsAdjoint, JointsTangent
 from cortado.solvers.projection.wall_sums import normal_part, types_by_name
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart
@@ -334,8 +334,7 @@ class BodiesAdjoint:
     def begin(self) -> None:
         self._joints.begin()
         for own in self._held:
-            for array in own.known.values():
-                array.zero_()
+            clear(own.known.values())
 
     def _loosen(self, context: StepContext, y: wp.array, y_bar: wp.array) -> None:
         bodies, bars = self._bodies, [{**own.moved, **own.faster} for own in self._held]
@@ -351,12 +350,10 @@ class BodiesAdjoint:
     def settle(self, context: StepContext, y: wp.array, y_bar: wp.array) -> None:
         for own, changes in zip(self._held, self._changes, strict=True):
             copy_each(changes.moved, own.moved)
-            for array in own.faster.values():
-                array.zero_()
+            clear(own.faster.values())
         self._loosen(context, y, y_bar)
         for own in self._held:
-            for array in own.moved.values():
-                array.zero_()
+            clear(own.moved.values())
 
     def drifted(self, context: StepContext, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
         """Apply the adjoint of `Bodies.drifted`. The results are added to ``drift_bar`` and ``y_bar``."""
@@ -377,8 +374,7 @@ class BodiesAdjoint:
     def release(self, context: StepContext, k_before: wp.array, k_before_bar: wp.array) -> None:
         for k, held in enumerate(self._bodies.held):
             if held.body.table.sticks:
-                for array in self._held[k].known.values():
-                    array.zero_()
+                clear(self._held[k].known.values())
                 sums = dict(zip(self._sums_bar, self._changes[k].pressed.values(), strict=True))
                 pulled = {"y": k_before, "y_bar": k_before_bar}
                 context.launch(self._bodies.kernels.pull.adjoint, sums, *self._known(context, k), pulled)

@@ -12,6 +12,7 @@ from cortado.device.cells import CellSort
 from cortado.device.grid import Grid
 from cortado.device.launching import Named
 from cortado.device.precision import FLOAT32
+from cortado.particles.state import clear
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.projection.bodies import Bodies, BodiesAdjoint, BodiesTangent
 from cortado.solvers.projection.coarse_levels import Levels
@@ -67,7 +68,7 @@ class Coarse:
         self._none = self.numbers()
         """Zeros as initial values of the coarse pressure."""
         self.still = layout.arrays(still=vector)["still"]
-        self.unmoved = {"carried": layout.arrays(carried=real)["carried"]}
+        self.unmoved = layout.arrays(carried=real)
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)
 
     def numbers(self) -> wp.array:
@@ -178,8 +179,7 @@ class CoarseAdjoint:
         self._sum = layout.sum_of(precision.pair)
 
     def begin(self) -> None:
-        for array in self._bars.values():
-            array.zero_()
+        clear(self._bars.values())
 
     def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
         """``at`` contains the adjoints before the correction, and ``new`` the adjoints after the correction."""

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from cortado.device.launching import Named
-from cortado.particles.state import Layout, zeros
+from cortado.particles.state import Layout, clear, zeros
 from cortado.scene.links import Joint
 from cortado.solvers.projection.joint_kernels import ROW, joint_kernels
 from cortado.sph.free_solids import FreeSolidsPart
@@ -220,8 +220,7 @@ class JointsAdjoint:
 
     def begin(self) -> None:
         for group in (*self._bars.rows, self._bars.whole):
-            for array in group.values():
-                array.zero_()
+            clear(group.values())
 
     def join(self, step: StepContext, moved: Sequence[Arrays], moved_bar: Sequence[Arrays]) -> None:
         """Apply the adjoint of `Joints.join` to the adjoints of velocities, ``moved_bar``."""
@@ -247,8 +246,7 @@ class JointsAdjoint:
             step.launch(of.kernels.weigh.adjoint, *changes, *known, threads=members)
         for k, row, kernels, known in of.frames(step):
             rates = {"place_bar": bar.parameters[row.place], "time_step_bar": bar.parameters["time_step"]}
-            for array in self._poses.values():
-                array.zero_()
+            clear(self._poses.values())
             step.launch(kernels.adjoint, bars.rows[k], rates, self._poses, *known, threads=members)
             for way, number in (("", of.number(row)), ("other_", row.joint.against)):
                 bar.solids.add_whole(number, **{name: self._poses[f"{way}{name}"] for name in BARS})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.errors import InputError
-from cortado.particles.state import Parameters, State
+from cortado.particles.state import Parameters, State, clear
 from cortado.particles.wall_terms import solid_kernel
 from cortado.scene.solvers import ProjectionSolver
 from cortado.solvers.build import SolverSetting, particle_system
@@ -169,8 +169,7 @@ class ProjectionAdjoint(ParticleAdjoint):
         scene |= {"m_scene": state_bar["reference_density"], "m": self._m_unused}
         context.launch(solver.integration.sort, scene, x=own["x_now_bar"], v=own["u_bar"])
         kept = (own[f"{name}_bar"] for name in ("x_moved", "c", "y", "A"))
-        for array in (*self.bar.fields.arrays(), *kept):
-            array.zero_()
+        clear((*self.bar.fields.arrays(), *kept))
         self.density.begin()
         wp.copy(own["k_bar"], self.carried_bar[IMPULSE])
         wp.copy(own["kick_bar"], self.carried_bar[KICK])

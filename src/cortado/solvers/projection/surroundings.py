@@ -9,6 +9,7 @@ from cortado.device.launching import bundle
 from cortado.device.modules import Kernels
 from cortado.device.precision import Precision, TypesByName
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
+from cortado.particles.state import clear
 from cortado.particles.wall_terms import solid_kernel
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.projection.effects import effect_functions, image_share, image_sums
@@ -182,20 +183,9 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     def own_adjoint(least: real, m, n_bar, of, m_bar, bar, M_pull, Q_pull):
         i = wp.tid()
         M_bar, Q_bar, g_bar, gamma_bar, mirror_bar, nu_bar, behind_bar, m_i_bar = back(
-            of.M[i],
-            of.Q[i],
-            of.g[i],
-            of.beside[i],
-            of.mirror[i],
-            of.nu[i],
-            of.behind[i],
-            m[i],
-            least,
-            bar.L[i],
-            bar.a[i],
-            bar.weights[i],
-            bar.coarse[i],
-        )
+            of.M[i], of.Q[i], of.g[i], of.beside[i], of.mirror[i], of.nu[i], of.behind[i], m[i], least,
+            bar.L[i], bar.a[i], bar.weights[i], bar.coarse[i],
+        )  # fmt: skip
         m_bar[i] = m_bar[i] + m_i_bar
         M_pull[i] = pack(bar.M[i] + M_bar)
         Q_pull[i] = pack(Q_bar)
@@ -281,8 +271,7 @@ class SurroundingsAdjoint(DensityAdjoint):
         self._moments = layout.arrays("_pull", M=precision.six, Q=precision.six)
 
     def begin(self) -> None:
-        for array in self.around.values():
-            array.zero_()
+        clear(self.around.values())
 
     def measure(self, context: StepContext, bar: Adjoints) -> None:
         own, known = self._density, (*bar.named, self.around, self._density.around)
