@@ -218,8 +218,7 @@ def _check_phases(scene: SceneTables) -> None:
             wanted = "left out where there are several phases"
             raise field_error(("phase", index, "rheology"), phase.rheology.kind, wanted)
     if scene.phase[0].rheology is not None and scene.forces.viscosity != "stress":
-        found = scene.forces.viscosity
-        raise field_error(("forces", "viscosity"), found, '"stress", as the phase has a rheology')
+        raise field_error(("forces", "viscosity"), scene.forces.viscosity, '"stress", as the phase has a rheology')
     if scene.forces.viscosity == "pairwise" and scene.solver.kind != "pcisph":
         wanted = '"stress" or "none", as the solver is not "pcisph"'
         raise field_error(("forces", "viscosity"), "pairwise", wanted)
@@ -242,8 +241,7 @@ def _check_sensors(scene: SceneTables) -> None:
             check_free_body((*path, "solid"), sensor.solid, scene.solid)
         elif sensor.kind != "flow_rate":
             if sensor.on is not None:
-                wanted = "left out, as no solid moves"
-                check_name((*path, "on"), sensor.on, moving, "a solid that moves", wanted)
+                check_name((*path, "on"), sensor.on, moving, "a solid that moves", "left out, as no solid moves")
             if sensor.kind != "pressure_probe" and sensor.axes == "body" and sensor.on is None:
                 raise field_error((*path, "axes"), sensor.axes, '"world", as the sensor is on no solid')
 

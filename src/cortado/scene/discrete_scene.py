@@ -249,8 +249,12 @@ def discretise(scene: Scene) -> DiscreteScene:
     masses = FluidMasses.of(scene, fluid)
     for sentence in (*thin_sentences(scene), *standing_sentences(scene)):
         warn(sentence)
-    if masses.warning:
-        warn(masses.warning, MassWarning)
+    if masses.off:
+        warn(
+            f"the fluid begins with {' and '.join(masses.off.values())}: boxes whose sides are whole multiples of the "
+            "spacing have exactly what is asked for, and of other shapes a smaller spacing comes nearer.",
+            MassWarning,
+        )
     if most := scene.discretisation.jitter * spacing:
         moved = fluid.positions + np.random.default_rng(0).uniform(-most, most, fluid.positions.shape)
         fluid = replace(fluid, positions=np.where(fluid.is_placed[:, None], fluid.positions, moved))

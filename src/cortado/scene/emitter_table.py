@@ -50,8 +50,7 @@ class EmitterSample:
         return np.where(np.ravel(again) > 0.0, joined, found)
 
     def waits(self, name: str, first: int, others: Any, particles: int) -> NDArray[np.bool_]:
-        emitted = float(np.ravel(others[emitted_name(name)])[0])
-        return self.in_line(name, first, others, particles) > emitted
+        return self.in_line(name, first, others, particles) > float(np.ravel(others[emitted_name(name)])[0])
 
 
 OF_OPENINGS = ("emitted", "again", "drained", ".count")

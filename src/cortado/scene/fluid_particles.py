@@ -260,12 +260,3 @@ class FluidMasses:
             for name, given in self.given.items()
             if abs(given - self.asked[name]) > EXCESS * self.asked[name]
         }
-
-    @property
-    def warning(self) -> str | None:
-        if not self.off:
-            return None
-        return (
-            f"the fluid begins with {' and '.join(self.off.values())}: boxes whose sides are whole multiples of the "
-            "spacing have exactly what is asked for, and of other shapes a smaller spacing comes nearer."
-        )

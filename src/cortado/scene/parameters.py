@@ -290,11 +290,8 @@ def ending(end: str) -> Callable[[str], str]:
 
 
 LOAD = ".load"
-
-
-def load_name(solid: str) -> str:
-    """Return the name of the fluid load, such as "rotor.load": force [N] and torque [N m], in 2-D [N/m] and [N]."""
-    return f"{solid}{LOAD}"
+load_name = ending("load")
+"""Name of the fluid load on a solid, such as "rotor.load": force [N] and torque [N m], in 2-D [N/m] and [N]."""
 
 
 def is_load(name: object) -> bool:

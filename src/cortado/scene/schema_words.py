@@ -72,7 +72,8 @@ def unit_of(key: str) -> str:
     """Return the unit of a key such as ``phase.0.viscosity``. The text is empty for a key without a unique unit."""
     found = list(_choices(_schema()))
     for part in key.split("."):
-        found = [choice for one in found for choice in _choices(_part(one, part))]
+        inner = [one.get("items", {}) if part.isdigit() else one.get("properties", {}).get(part, {}) for one in found]
+        found = [choice for one in inner for choice in _choices(one)]
     units = {choice["unit"] for one in found for choice in (one, *_choices(one.get("items", {}))) if "unit" in choice}
     return units.pop() if len(units) == 1 and units != {"-"} else ""
 
@@ -81,11 +82,6 @@ def unit_of(key: str) -> str:
 def _schema() -> Schema:
     read: Schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     return read
-
-
-def _part(schema: Schema, part: str) -> Schema:
-    found: Schema = schema.get("items", {}) if part.isdigit() else schema.get("properties", {}).get(part, {})
-    return found
 
 
 def _choices(schema: Schema) -> Iterator[Schema]:

@@ -17,6 +17,8 @@ class SensorTable(Table):
 
     name: Text
     """Name of the sensor. Column names in sensors.csv begin with the name of the sensor."""
+    kind: str
+    """Kind of the sensor."""
 
     @field_validator("name")
     @classmethod
@@ -32,7 +34,6 @@ class PressureProbeTable(SensorTable):
     """A sensor of the mean pressure of the particles around a point."""
 
     kind: Literal["pressure_probe"]
-    """Kind of the sensor."""
     position: Vector[Length]
     """(d,) Position of the point [m]."""
     radius: Reach = None
@@ -45,7 +46,6 @@ class WaveGaugeTable(SensorTable):
     """A sensor of the height of the free surface in a vertical column."""
 
     kind: Literal["wave_gauge"]
-    """Kind of the sensor."""
     position: Vector[Length]
     """(d,) A point on the axis of the column [m]; its height has no effect."""
     floor: Length = 0.0
@@ -64,7 +64,6 @@ class FlowRateTable(SensorTable):
     """A sensor of the volume of fluid that flows through a plane per second."""
 
     kind: Literal["flow_rate"]
-    """Kind of the sensor."""
     position: Vector[Length]
     """(d,) A point of the plane [m]."""
     normal: Direction
@@ -78,7 +77,6 @@ class WallForceTable(SensorTable, Ordered):
     """A sensor of the force and torque of the fluid on walls in a region."""
 
     kind: Literal["wall_force"]
-    """Kind of the sensor."""
     lower: OnAxes[Length] = None
     """(d,) Lower corner of the region [m]; if left out, the region has no lower end."""
     upper: OnAxes[Length] = None
@@ -95,7 +93,6 @@ class SolidLoadTable(SensorTable):
     """A sensor of the force and torque of the fluid on a solid. The torque is about the solid's middle."""
 
     kind: Literal["solid_load"]
-    """Kind of the sensor."""
     solid: Text
     """Name of the solid."""
     axes: Axes = "world"
@@ -106,7 +103,6 @@ class SpringForceTable(SensorTable):
     """A sensor of the tension and the length of a spring."""
 
     kind: Literal["spring_force"]
-    """Kind of the sensor."""
     spring: Text
     """Name of the spring."""
 
@@ -115,7 +111,6 @@ class BodyMotionTable(SensorTable):
     """A sensor of the position, rotation, velocity and angular velocity of a free body."""
 
     kind: Literal["body_motion"]
-    """Kind of the sensor."""
     solid: Text
     """Name of the free body."""
 
