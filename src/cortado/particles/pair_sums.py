@@ -305,11 +305,11 @@ def image_sum_of_solid(total: Any) -> Any:
     return summed(total.key, d, total.arrays, others, total.results, loop, scope, total.module)
 
 
-def rubbing_sum(d: Discretisation, sticks: bool) -> Callable[..., Decorator]:
+def rubbing_sum(d: Discretisation, sticks: bool, typed: Typed) -> Callable[..., Decorator]:
     """If fluid ``sticks`` to walls, the sums include walls without slip."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
-        return pair_sum(d, None, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, None, ahead)
+        return pair_sum(d, typed, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, typed, ahead)
 
     return summed
 

@@ -346,4 +346,5 @@ def _free_solids(
     pushes.append(lambda part: Contacts(part, touching, spacing, discrete.periods))
     if springs or turned:
         pushes.append(lambda part: Springs(part, springs, turned, layout))
-    return FreeSolids(tables, scene.dimension, search, pushes, joined)
+    assert search.moving is not None
+    return FreeSolids(tables, scene.dimension, search.moving, pushes, joined)

@@ -226,12 +226,6 @@ def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     )
 
 
-def entries(precision: Precision) -> dict[str, Any]:
-    real, vector, matrix = precision.real, precision.vector, precision.matrix
-    vectors, matrices, numbers = dict.fromkeys("gqe", vector), dict.fromkeys("BD", matrix), dict.fromkeys("zwcab", real)
-    return {**vectors, **matrices, **numbers}
-
-
 @cache
 def curvature_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
     precision, (real, vector, _) = discretisation.precision, discretisation.types

@@ -123,14 +123,11 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
         below = y[0] < m.lower[0] or y[1] < m.lower[1] or y[2] < m.lower[2]
         return not below and y[0] <= m.upper[0] and y[1] <= m.upper[1] and y[2] <= m.upper[2]
 
-    @particle_kernel(module, "waits", numbers=["nozzle", "particles"])
-    @typed
+    @particle_kernel(module, "waits", numbers=["nozzle", "particles"], typed=typed)
     def wait(i: int, member: int, particles: int, nozzle, emitted, serial_i, waits_i) -> real:
-        in_line = remaining(i - member * particles, nozzle, serial_i, emitted) > real(0.0)
-        return wp.where(in_line, real(1.0), waits_i)
+        return wp.where(remaining(i - member * particles, nozzle, serial_i, emitted) > real(0.0), real(1.0), waits_i)
 
-    @particle_kernel(module, "taken fresh", numbers=["mouth"])
-    @typed
+    @particle_kernel(module, "taken fresh", numbers=["mouth"], typed=typed)
     def take(i: int, mouth, middle, waits_i, x_i, taken_i) -> tuple[real, real]:
         found, fresh = wp.where(waits_i > real(0.0), real(0.0), taken_i), real(0.0)
         if found == real(0.0) and waits_i == real(0.0) and contains(x_i, middle, mouth):
@@ -138,8 +135,7 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
             fresh = real(1.0)
         return found, fresh
 
-    @particle_kernel(module, "x v", numbers=["particles"])
-    @typed
+    @particle_kernel(module, "x v", numbers=["particles"], typed=typed)
     def park(
         i: int, member: int, particles: int, places: wp.array(dtype=vector), taken_i, x_free_i, v_free_i
     ) -> tuple[vector, vector]:
@@ -147,8 +143,7 @@ def drain_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels]
         return wp.where(taken_i > real(0.0), place, x_free_i), wp.where(taken_i > real(0.0), at_rest, v_free_i)
 
     def held(results: str) -> Any:
-        @particle_kernel(derivatives, results, name=f"park_{results.split('_')[-1]}")
-        @typed
+        @particle_kernel(derivatives, results, name=f"park_{results.split('_')[-1]}", typed=typed)
         def hold(taken_i, x_of_i, v_of_i) -> tuple[vector, vector]:
             no = vector()
             return wp.where(taken_i > real(0.0), no, x_of_i), wp.where(taken_i > real(0.0), no, v_of_i)
@@ -190,13 +185,11 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
     of_scene = TypesByName(real, {wp.int32: "step", rows: "table", wp.float64: "behind count"})
     most = wp.constant(wp.float64(MOST))
 
-    @wp.kernel(module=modules[0], enable_backward=False)
-    @of_scene.arrays
+    @of_scene.kernel(modules[0], enable_backward=False)
     def tally(taken_sum, count):
         count[wp.tid()] = count[wp.tid()] + wp.float64(taken_sum[wp.tid()])
 
-    @wp.kernel(module=modules[0], enable_backward=False)
-    @of_scene.arrays
+    @of_scene.kernel(modules[0], enable_backward=False)
     def fall_behind(step, table: rows, time_step, taken_sum, cell: real, holds: real, behind, gain):
         m = wp.tid()
         held = wp.float64(holds)
@@ -204,13 +197,11 @@ def pull_kernels(precision: Precision, taped: bool) -> tuple[Any, Any, Kernels, 
         due = behind[m] + wp.float64(table[m, step[m]]) * wp.float64(time_step[m]) / wp.float64(cell)
         behind[m] = wp.clamp(due - wp.float64(taken_sum[m]), -most * held, most * held)
 
-    @wp.kernel(module=modules[0])
-    @of_scene.arrays
+    @of_scene.kernel(modules[0])
     def read(step, table: rows, gain, flow):
         flow[wp.tid()] = gain[wp.tid()] * table[wp.tid(), step[wp.tid()]]
 
-    @wp.kernel(module=modules[1], enable_backward=False)
-    @of_scene.arrays
+    @of_scene.kernel(modules[1], enable_backward=False)
     def add_to(step, table: rows, gain, total):
         table[wp.tid(), step[wp.tid()]] = table[wp.tid(), step[wp.tid()]] + gain[wp.tid()] * total[wp.tid()]
 

@@ -72,15 +72,13 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
     def advance(flow_rate: real, area: real, time_step: real) -> wp.float64:
         return wp.float64(flow_rate) / wp.float64(area) * wp.float64(time_step)
 
-    @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"])
-    @typed
+    @particle_kernel(module, "outlet drift emitted", numbers=["nozzle"], typed=typed)
     def begin(i, nozzle, path, flow, step_i, time_step_i, q_in_i, emitted_in_i) -> tuple[vector, vector, wp.float64]:
         q, flow_rate = path[i, step_i], flow[i, step_i]
         drift = (q - q_in_i) / time_step_i + (flow_rate / nozzle.area) * nozzle.direction
         return q, drift, emitted_in_i + advance(flow_rate, nozzle.area, time_step_i)
 
-    @particle_kernel(derivatives, "outlet_dot drift_dot emitted_dot", numbers=["nozzle"])
-    @typed
+    @particle_kernel(derivatives, "outlet_dot drift_dot emitted_dot", numbers=["nozzle"], typed=typed)
     def begin_tangent(
         i, nozzle, path_dot, flow, flow_dot, step_i, time_step_i, time_step_dot_i, drift_i, q_in_dot_i, emitted_in_dot_i
     ) -> tuple[vector, vector, wp.float64]:
@@ -91,8 +89,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
         faster = advance(flow_rate_dot, nozzle.area, time_step_i)
         return q_dot, drift_dot, emitted_in_dot_i + faster + advance(flow_rate, nozzle.area, time_step_dot_i)
 
-    @particle_kernel(derivatives, "outlet_bar emitted_bar +time_step_bar", numbers=["nozzle"])
-    @typed
+    @particle_kernel(derivatives, "outlet_bar emitted_bar +time_step_bar", numbers=["nozzle"], typed=typed)
     def begin_adjoint(
         i, nozzle, path_bar, flow, flow_bar, step_i, time_step_i, drift_i, x_sum_i, v_sum_i, outlet_bar_i, emitted_bar_i
     ) -> tuple[vector, wp.float64, real]:
@@ -104,8 +101,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
         flow_bar[i, step_i] = flow_bar[i, step_i] + further * time_step_i + faster
         return -v_sum_i / time_step_i, whole, further * flow_rate + longer
 
-    @particle_kernel(module, "x v", numbers=numbers)
-    @typed
+    @particle_kernel(module, "x v", numbers=numbers, typed=typed)
     def prescribe(
         i, member, particles, nozzle, outlet, drift, emitted, places, serial_i, x_free_i, v_free_i
     ) -> tuple[vector, vector]:
@@ -122,8 +118,7 @@ def emitter_kernels(precision: Precision, taped: bool) -> tuple[Kernels, Kernels
             v = drift
         return x, v
 
-    @particle_kernel(derivatives, "x_dot v_dot", numbers=numbers)
-    @typed
+    @particle_kernel(derivatives, "x_dot v_dot", numbers=numbers, typed=typed)
     def prescribe_tangent(
         i, member, particles, nozzle, emitted, outlet_dot, drift_dot, emitted_dot, serial_i, x_dot_i, v_dot_i
     ) -> tuple[vector, vector]:
@@ -154,8 +149,7 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
     numbers = {nozzle_of: "nozzle", wp.float64: "serial emitted", wp.int32: "i member particles"}
     typed = TypesByName(real, {**numbers, wp.array(dtype=wp.int32): "held before", wp.array(dtype=wp.bool): "drains"})
 
-    @particle_kernel(module, "held", numbers=["nozzle", "particles"])
-    @typed
+    @particle_kernel(module, "held", numbers=["nozzle", "particles"], typed=typed)
     def hold(i, member, particles, nozzle, emitted_in, drains, drained_i, serial_i) -> wp.int32:
         in_line = remaining(i - member * particles, nozzle, serial_i, emitted_in) > real(0.0)
         return wp.where(drains[int(drained_i)] and not in_line, 1, 0)
@@ -164,8 +158,7 @@ def feeding_kernels(precision: Precision, taped: bool) -> tuple[Any, Any]:
     def layers(nozzle: nozzle_of, emitted: wp.float64) -> wp.float64:
         return wp.floor((emitted + wp.float64(nozzle.column)) / nozzle.spacing + wp.float64(0.5))
 
-    @particle_kernel(module, "serial", numbers=["nozzle", "particles"])
-    @typed
+    @particle_kernel(module, "serial", numbers=["nozzle", "particles"], typed=typed)
     def join(i, member, particles, nozzle, emitted_in, emitted, held, before, serial_in_i) -> wp.float64:
         layer = wp.float64(nozzle.layer)
         first = wp.max(layers(nozzle, emitted_in), wp.float64(nozzle.count) / layer)

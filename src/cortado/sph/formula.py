@@ -93,15 +93,13 @@ def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
     """``pack`` copies a parameter's values in a step to the array ``table``. ``add`` does the reverse for adjoints."""
     typed = TypesByName(wp.array2d(dtype=precision.real), {wp.int32: "step"})
 
-    @wp.kernel(module=arrays_module(precision, True, taped))
-    @typed.arrays
+    @typed.kernel(arrays_module(precision, True, taped))
     def pack(first: int, size: int, step, values, table):
         member, k = wp.tid() // size, wp.tid() % size
         row = wp.min(step[member], values.shape[1] // size - 1)
         table[member, first + k] = values[member, row * size + k]
 
-    @wp.kernel(module=arrays_module(precision, False), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(arrays_module(precision, False), enable_backward=False)
     def add(first: int, size: int, step, table, values):
         member, k = wp.tid() // size, wp.tid() % size
         column = wp.min(step[member], values.shape[1] // size - 1) * size + k

@@ -212,14 +212,12 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
 
     typed = TypesByName(real, {vector: "x", fractions: "u y", neighbourhood: "s"})
 
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def spread(x_ij, n_i, n_j, w_i, w_j, u_ij, s) -> fractions:
         return ((w_i / n_j + w_j / n_i) * factor(x_ij, s)) * u_ij
 
     @tangent_of(spread)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def spread_tangent(
         x_ij, x_dot_ij, n_i, n_j, n_dot_i, n_dot_j, w_i, w_j, w_dot_i, w_dot_j, u_ij, u_dot_ij, s
     ) -> fractions:
@@ -230,8 +228,7 @@ def pairwise_laplacian_functions(discretisation: Discretisation, phases: int) ->
         return (weight_dot * f + weight * f_dot) * u_ij + (weight * f) * u_dot_ij
 
     @adjoint_of(spread)
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def spread_adjoint(x_ij, n_i, n_j, w_i, w_j, u_ij, y_i, y_ij, s) -> tuple[vector, real, real, fractions, real]:
         f = factor(x_ij, s)
         weight = w_i / n_j + w_j / n_i
@@ -309,21 +306,18 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
 
     typed = TypesByName(real, {fractions: "B c chi", neighbourhood: "s", vector: "x"})
 
-    @particle_kernel(module, "chi w", [over(spread, "B", **of_c)], numbers=["strength"])
-    @typed
+    @particle_kernel(module, "chi w", [over(spread, "B", **of_c)], numbers=["strength"], typed=typed)
     def potential(B, strength, interface_width, mobility, m_i, c_i, s) -> tuple[fractions, real]:
         stiffness = interface_width * interface_width * s.volume / m_i
         return strength * project(energy_gradient(c_i)) - stiffness * B, m_i * mobility * mobile(c_i)
 
-    @particle_kernel(module, "c_new", [over(spread, "B", **of_chi)], numbers=["substeps"])
-    @typed
+    @particle_kernel(module, "c_new", [over(spread, "B", **of_chi)], numbers=["substeps"], typed=typed)
     def flux(B, substeps: int, time_step, m_i, c_i, s) -> fractions:
         return c_i + (time_step / real(substeps) * s.volume / m_i) * B
 
     both = [over(spread, "B", **of_c), over(spread_tangent, "B_dot", **of_c, **dotted(of_c))]
 
-    @particle_kernel(tangent_module, "chi_dot w_dot", both, numbers=["strength"])
-    @typed
+    @particle_kernel(tangent_module, "chi_dot w_dot", both, numbers=["strength"], typed=typed)
     def potential_tangent(
         B, B_dot, strength, interface_width, interface_width_dot, mobility, mobility_dot, m_i, m_dot_i, c_i, c_dot_i, s
     ) -> tuple[fractions, real]:
@@ -336,14 +330,12 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
 
     both = [over(spread, "B", **of_chi), over(spread_tangent, "B_dot", **of_chi, **dotted(of_chi))]
 
-    @particle_kernel(tangent_module, "c_new_dot", both, numbers=["substeps"])
-    @typed
+    @particle_kernel(tangent_module, "c_new_dot", both, numbers=["substeps"], typed=typed)
     def flux_tangent(B, B_dot, substeps: int, time_step, time_step_dot, m_i, m_dot_i, c_dot_i, s) -> fractions:
         scale = time_step / real(substeps) * s.volume / m_i
         return c_dot_i + scale * (B_dot + (time_step_dot / time_step - m_dot_i / m_i) * B)
 
-    @particle_kernel(adjoint_module, "y", numbers=["substeps"])
-    @typed
+    @particle_kernel(adjoint_module, "y", numbers=["substeps"], typed=typed)
     def scale_adjoint(substeps: int, time_step, m_i, c_bar_i, s) -> fractions:
         return (time_step / real(substeps) * s.volume / m_i) * c_bar_i
 
@@ -365,8 +357,7 @@ def diffusion_kernels(diffusion: Diffusion) -> SimpleNamespace:
 
     of_potential = [over(spread_adjoint, "x_sum n_sum m_sum c_sum own", y="z", **of_c)]
 
-    @particle_kernel(adjoint_module, "+x_bar +n_bar +m_bar +c_bar +interface_width_bar", of_potential)
-    @typed
+    @particle_kernel(adjoint_module, "+x_bar +n_bar +m_bar +c_bar +interface_width_bar", of_potential, typed=typed)
     def potential_adjoint(
         x_sum, n_sum, m_sum, c_sum, own, interface_width, m_i
     ) -> tuple[vector, real, real, fractions, real]:

@@ -24,7 +24,6 @@ from cortado.device.reduction import add
 from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls
-from cortado.particles.neighbours import NeighbourSearch
 from cortado.particles.particle_kernels import pointwise_kernels
 from cortado.particles.state import Entry, Layout, Parameters, State, StateField
 from cortado.scene.links import Hold, Joint, inertia_about
@@ -44,24 +43,18 @@ def free_kernels(precision: Precision, dimension: int) -> tuple[Kernels, Kernels
     rate, freed, spin, held = hold.rate, hold.freed, hold.spin, hold.kind
     angle, begun_rotation, modules = flat.angle, flat.rotation, [free_module(precision, f"bodies_{dimension}d")] * 3
 
-    if dimension == 2:
-
-        @wp.func
-        def about(w: angle) -> vector:
+    @wp.func
+    def about(w: angle) -> vector:
+        if wp.static(dimension == 2):
             return vector(real(0.0), real(0.0), w)
-
-        @wp.func
-        def angle_of(w: vector) -> angle:
-            return w[2]
-
-    else:
-
-        @wp.func
-        def about(w: angle) -> vector:
+        else:
             return w
 
-        @wp.func
-        def angle_of(w: vector) -> angle:
+    @wp.func
+    def angle_of(w: vector) -> angle:
+        if wp.static(dimension == 2):
+            return w[2]
+        else:
             return w
 
     @wp.func
@@ -146,14 +139,9 @@ class FreeTable:
 class FreeSolids:
     tables: Sequence[FreeTable]
     dimension: int
-    search: NeighbourSearch
+    walls: MovingWalls
     pushes: "Sequence[Callable[[FreeSolidsPart], Push]]"
     joints: Sequence[Joint] = ()
-
-    @property
-    def walls(self) -> MovingWalls:
-        assert self.search.moving is not None
-        return self.search.moving
 
     def part(self, layout: Layout, requires_grad: bool) -> "FreeSolidsPart":
         if requires_grad:
@@ -215,8 +203,7 @@ class FreeBody(Motions):
         return {f"{label}{suffix}": state[name] for label, name in self.names.items()}
 
     def known(self, step: StepContext) -> tuple[Named, ...]:
-        density = step.parameters[self.table.weight]
-        return self.constants, self.state(self.begun), {"density": density}
+        return self.constants, self.state(self.begun), {"density": step.parameters[self.table.weight]}
 
 
 class Changes(Motions):

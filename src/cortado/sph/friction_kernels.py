@@ -39,10 +39,60 @@ from cortado.sph.stress_kernels import fluidity_function, traction_function
 
 
 @cache
-def friction_functions(precision: Precision) -> SimpleNamespace:
-    """``rub`` returns a particle's acceleration and couple. ``bear`` returns force and torque on the body."""
-    real, vector, matrix, six = precision.real, precision.vector, precision.matrix, precision.six
-    typed = TypesByName(real, {vector: "v arm Y V W rub couple", matrix: "T N"})
+def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
+    """``rub`` returns a particle's acceleration and couple, and ``bear`` the body's force and torque. ``hold`` computes
+    the sums H, Y and N. ``thicken``, ``pull`` and ``push`` add the terms of the body to sums, stresses and
+    accelerations of particles."""
+    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
+    matrix, six, known = precision.matrix, precision.six, moment_functions(precision, dimension)
+    contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
+    fall, fall_change = contact.fall, contact.fall_change
+    hold_weight, hold_gradient = contact.hold, contact.hold_gradient
+    fluidity, separation = fluidity_function(precision), pair_functions(discretisation).separation
+    modules = module, tangent_module, adjoint_module = discretisation.modules(f"free_friction_{dimension}d")
+    traction, whole = traction_function(precision, dimension, module), known.change
+    vectors = "x v foot turn arm Y V W after led diagonal others total rub couple"
+    typed = TypesByName(real, {vector: vectors, matrix: "T M N", neighbourhood: "s", wp.int32: "solid"})
+    four = tuple[real, vector, vector, vector]
+
+    @solid_sum(discretisation, typed)
+    def grip(x_ij, least, foot, solid, s) -> four:
+        w, y = hold_weight(x_ij, foot, least, s), fall(x_ij, foot)
+        return w, w * y, w * wp.cw_mul(y, y), w * cross_terms(y, y)
+
+    @solid_sum(discretisation, typed)
+    def grip_tangent(x_ij, x_dot_ij, least, foot, turn_dot, solid, s) -> four:
+        w, y, rest = hold_weight(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
+        u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
+        w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest)
+        others = w_dot * cross_terms(y, y) + w * (cross_terms(y, u) + cross_terms(u, y))
+        return w_dot, w_dot * y + w * u, wp.cw_mul(w_dot * y + real(2.0) * w * u, y), others
+
+    @solid_sum(discretisation, typed)
+    def grip_back(x_ij, H_bar_i, Y_bar_i, N_bar_i, least, foot, solid, s) -> vector:
+        w, y = hold_weight(x_ij, foot, least, s), fall(x_ij, foot)
+        even = N_bar_i * y + wp.transpose(N_bar_i) * y
+        level = H_bar_i + wp.dot(Y_bar_i, y) + real(0.5) * wp.dot(y, even)
+        return level * hold_gradient(x_ij, foot, least, s) + w * fall_change(x_ij, Y_bar_i + even, foot)
+
+    numbers = ["solid", "least"]
+
+    @particle_kernel(module, "H Y N arm", [over(grip, "held led diagonal others")], numbers=numbers, typed=typed)
+    def hold(solid, held, led, diagonal, others, x_i, after, s) -> tuple[real, vector, matrix, vector]:
+        return held, led, whole(diagonal, others), separation(x_i, after, s)
+
+    changes = over(grip_tangent, "held led diagonal others")
+
+    @particle_kernel(tangent_module, "H_dot Y_dot N_dot arm_dot", [changes], numbers=numbers, typed=typed)
+    def hold_tangent(solid, held, led, diagonal, others, x_dot_i, after_dot) -> tuple[real, vector, matrix, vector]:
+        return held, led, whole(diagonal, others), x_dot_i - after_dot
+
+    @particle_kernel(adjoint_module, "+x_bar +force_bar +torque_bar", [over(grip_back, "total")], numbers=numbers)
+    @typed
+    def hold_adjoint(solid, total, arm_i, Y_i, N_i, Y_bar_i, N_bar_i, arm_bar_i) -> tuple[vector, vector, vector]:
+        B = N_i * (N_bar_i + wp.transpose(N_bar_i))
+        turned = vector(B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0])
+        return total + arm_bar_i, -total - arm_bar_i, wp.cross(Y_i, Y_bar_i) + turned - wp.cross(arm_i, total)
 
     @typed
     def lean(v_i, arm_i, Y_i, N_i, V, W) -> matrix:
@@ -61,77 +111,12 @@ def friction_functions(precision: Precision) -> SimpleNamespace:
         f, t = -m_i * rub_i, m_i * (couple_i - wp.cross(arm_i, rub_i))
         return six(f[0], f[1], f[2], t[0], t[1], t[2])
 
-    return SimpleNamespace(lean=lean, rub=rub, bear=bear)
-
-
-@cache
-def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNamespace:
-    """``hold`` computes the sums H, Y and N. ``thicken``, ``pull`` and ``push`` add the terms of the body to sums,
-    stresses and accelerations of particles."""
-    precision, (real, vector, neighbourhood) = discretisation.precision, discretisation.types
-    matrix, six, known = precision.matrix, precision.six, moment_functions(precision, dimension)
-    contact, cross_terms = contact_functions(discretisation), cross_terms_function(precision)
-    fall, fall_change = contact.fall, contact.fall_change
-    hold_weight, hold_gradient = contact.hold, contact.hold_gradient
-    fluidity, separation = fluidity_function(precision), pair_functions(discretisation).separation
-    modules = module, tangent_module, adjoint_module = discretisation.modules(f"free_friction_{dimension}d")
-    traction, whole = traction_function(precision, dimension, module), known.change
-    vectors = "x v foot turn arm Y V W after led diagonal others total"
-    typed = TypesByName(real, {vector: vectors, matrix: "T M N", neighbourhood: "s", wp.int32: "solid"})
-    four = tuple[real, vector, vector, vector]
-
-    @solid_sum(discretisation)
-    @typed
-    def grip(x_ij, least, foot, solid, s) -> four:
-        w, y = hold_weight(x_ij, foot, least, s), fall(x_ij, foot)
-        return w, w * y, w * wp.cw_mul(y, y), w * cross_terms(y, y)
-
-    @solid_sum(discretisation)
-    @typed
-    def grip_tangent(x_ij, x_dot_ij, least, foot, turn_dot, solid, s) -> four:
-        w, y, rest = hold_weight(x_ij, foot, least, s), fall(x_ij, foot), x_dot_ij - wp.cross(turn_dot, x_ij)
-        u = fall_change(x_ij, rest, foot) + wp.cross(turn_dot, y)
-        w_dot = wp.dot(hold_gradient(x_ij, foot, least, s), rest)
-        others = w_dot * cross_terms(y, y) + w * (cross_terms(y, u) + cross_terms(u, y))
-        return w_dot, w_dot * y + w * u, wp.cw_mul(w_dot * y + real(2.0) * w * u, y), others
-
-    @solid_sum(discretisation)
-    @typed
-    def grip_back(x_ij, H_bar_i, Y_bar_i, N_bar_i, least, foot, solid, s) -> vector:
-        w, y = hold_weight(x_ij, foot, least, s), fall(x_ij, foot)
-        even = N_bar_i * y + wp.transpose(N_bar_i) * y
-        level = H_bar_i + wp.dot(Y_bar_i, y) + real(0.5) * wp.dot(y, even)
-        return level * hold_gradient(x_ij, foot, least, s) + w * fall_change(x_ij, Y_bar_i + even, foot)
-
-    numbers = ["solid", "least"]
-
-    @particle_kernel(module, "H Y N arm", [over(grip, "held led diagonal others")], numbers=numbers)
-    @typed
-    def hold(solid, held, led, diagonal, others, x_i, after, s) -> tuple[real, vector, matrix, vector]:
-        return held, led, whole(diagonal, others), separation(x_i, after, s)
-
-    changes = over(grip_tangent, "held led diagonal others")
-
-    @particle_kernel(tangent_module, "H_dot Y_dot N_dot arm_dot", [changes], numbers=numbers)
-    @typed
-    def hold_tangent(solid, held, led, diagonal, others, x_dot_i, after_dot) -> tuple[real, vector, matrix, vector]:
-        return held, led, whole(diagonal, others), x_dot_i - after_dot
-
-    @particle_kernel(adjoint_module, "+x_bar +force_bar +torque_bar", [over(grip_back, "total")], numbers=numbers)
-    @typed
-    def hold_adjoint(solid, total, arm_i, Y_i, N_i, Y_bar_i, N_bar_i, arm_bar_i) -> tuple[vector, vector, vector]:
-        B = N_i * (N_bar_i + wp.transpose(N_bar_i))
-        turned = vector(B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0])
-        return total + arm_bar_i, -total - arm_bar_i, wp.cross(Y_i, Y_bar_i) + turned - wp.cross(arm_i, total)
-
-    of = friction_functions(precision)
-    leaning, rubbing, bearing = (wp.func(one, module=module) for one in (of.lean, of.rub, of.bear))
+    leaning, rubbing, bearing = (wp.func(one, module=module) for one in (lean, rub, bear))
 
     around = bundle(H=real, Y=vector, N=matrix, arm=vector)
     arrays = TypesByName(real, {vector: "v V W product", matrix: "A M T", around: "body", six: "load"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @arrays.arrays
+    @arrays.kernel(module, enable_backward=False)
     def pull(particles: int, control: real, v, M, eta, body, V, W, A, T):
         i, member = wp.tid(), wp.tid() // particles
         if body.H[i] == real(0.0):
@@ -140,8 +125,7 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
         A[i] = A[i] + change
         T[i] = T[i] + traction(M[i], change, eta[i], control)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @arrays.arrays
+    @arrays.kernel(module, enable_backward=False)
     def push(particles: int, control: real, time_step, v, m, T, eta, body, V, W, product, share, load):
         i, member = wp.tid(), wp.tid() // particles
         if body.H[i] == real(0.0):
@@ -166,9 +150,9 @@ def friction_kernels(discretisation: Discretisation, dimension: int) -> SimpleNa
     return SimpleNamespace(
         hold=Kernels(hold, hold_tangent, hold_adjoint),
         thicken=made(thicken, ["M:M", "R:R"]),
-        lean=made(of.lean, ["A:A"]),
-        rub=made(of.rub, ["rub", "couple"], numbers=["control"]),
-        bear=made(of.bear, ["load"], summed=["load"]),
+        lean=made(lean, ["A:A"]),
+        rub=made(rub, ["rub", "couple"], numbers=["control"]),
+        bear=made(bear, ["load"], summed=["load"]),
         hang=made(hang, ["u:u"]),
         pull=pull,
         push=push,
@@ -195,13 +179,11 @@ def row_kernels(precision: Precision) -> SimpleNamespace:
     spin = hold.spin
     kinds = {vector: "V W pushed twisted", matrix: "turns", wp.int32: "going", hold.kind: "hold"}
     typed = TypesByName(real, {**kinds, six: "r rise p y product load impulse first"})
+    kernel = typed.kernel(module, enable_backward=False)
 
     @wp.func
     def both(V: vector, W: vector) -> six:
         return six(V[0], V[1], V[2], W[0], W[1], W[2])
-
-    def kernel(function: Any) -> Any:
-        return wp.kernel(typed.arrays(function), module=module, enable_backward=False)
 
     @kernel
     def lift(r, density, volume: real, inertia: matrix, inverse: matrix, hold, turns, rise, total):

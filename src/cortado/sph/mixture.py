@@ -42,8 +42,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
     materials = {numbers: "rest_density viscosity", wp.array(dtype=fractions): "c_scene"}
     typed = TypesByName(real, {fractions: "c", wp.int32: "order", **materials})
 
-    @particle_kernel(mixture_module(precision, phases, True, taped), "rho_0 mu")
-    @typed
+    @particle_kernel(mixture_module(precision, phases, True, taped), "rho_0 mu", typed=typed)
     def blend(member: int, c_i, rest_density, viscosity) -> tuple[real, real]:
         specific_volume = real(0.0)
         power = real(0.0)
@@ -52,8 +51,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
             power += c_i[k] * logarithm(viscosity[member, k])
         return real(1.0) / specific_volume, wp.exp(power)
 
-    @particle_kernel(mixture_module(precision, phases, False), "rho_0_dot mu_dot")
-    @typed
+    @particle_kernel(mixture_module(precision, phases, False), "rho_0_dot mu_dot", typed=typed)
     def blend_tangent(
         member: int, c_i, c_dot_i, rest_density, rest_density_dot, viscosity, viscosity_dot, rho_0_i, mu_i
     ) -> tuple[real, real]:
@@ -66,8 +64,7 @@ def mixture_kernels(precision: Precision, phases: int, taped: bool) -> SimpleNam
             power_dot += c_dot_i[k] * logarithm(mu_k) + c_i[k] * viscosity_dot[member, k] / (mu_k + tiny)
         return -rho_0_i * rho_0_i * change, mu_i * power_dot
 
-    @particle_kernel(mixture_module(precision, phases, False), "+rest_density_bar +viscosity_bar +c_bar")
-    @typed
+    @particle_kernel(mixture_module(precision, phases, False), "+rest_density_bar +viscosity_bar +c_bar", typed=typed)
     def blend_adjoint(
         member: int, order_i, c_i, rest_density, viscosity, rho_0_i, mu_i, rho_0_bar_i, mu_bar_i, c_scene_bar
     ) -> tuple[fractions, fractions, fractions]:

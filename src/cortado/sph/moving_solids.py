@@ -5,8 +5,7 @@ turns about the hinge: its inertia and its angular momentum are about the hinge,
 rotation.
 
 A solid with a prescribed path starts at its initial pose, and is displaced and turned by the path. The velocity of a
-wall particle is its displacement in a step divided by the time step. States contain the position, the rotations and the
-scale of a solid (`cortado.particles.moving_walls`).
+wall particle is its displacement in a step divided by the time step.
 
 Rotations are rotation vectors (Rodrigues), in 2-D angles. If the rotation vector w changes by a small vector u, the
 rotation is followed by the small rotation J u with the Jacobian

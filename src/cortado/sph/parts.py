@@ -309,14 +309,12 @@ def _kernels(a: wp.array) -> Any:
 def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
     typed = TypesByName(dtype, {wp.int32: "order"})
 
-    @wp.kernel(module=module)
-    @typed.arrays
+    @typed.kernel(module)
     def sort(order, a_scene, a):
         i = wp.tid()
         a[i] = a_scene[order[i]]
 
-    @wp.kernel(module=module)
-    @typed.arrays
+    @typed.kernel(module)
     def unsort(order, a, a_scene):
         i = wp.tid()
         a_scene[order[i]] = a[i]
@@ -345,17 +343,16 @@ def prediction_share(precision: Precision) -> Any:
 def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
     real, vector = precision.real, precision.vector
     typed = TypesByName(real, {wp.int32: "order", vector: "x v acceleration"})
+    adjoin_prediction, vectors = prediction_share(precision), wp.array(dtype=vector)
 
-    @wp.kernel(module=integration_module(precision, True, taped))
-    @typed.arrays
+    @typed.kernel(integration_module(precision, True, taped))
     def sort(order, x_scene, v_scene, m_scene, x, v, m):
         i = wp.tid()
         x[i] = x_scene[order[i]]
         v[i] = v_scene[order[i]]
         m[i] = m_scene[order[i]]
 
-    @wp.kernel(module=integration_module(precision, True, taped))
-    @typed.arrays
+    @typed.kernel(integration_module(precision, True, taped))
     def unsort(order, x, v, x_scene, v_scene):
         i = wp.tid()
         x_scene[order[i]] = x[i]
@@ -366,8 +363,7 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
         velocity = v_i + time_step * acceleration_i
         return x_i + time_step * velocity, velocity
 
-    @particle_kernel(integration_module(precision, False), "x_star_dot v_star_dot")
-    @typed
+    @particle_kernel(integration_module(precision, False), "x_star_dot v_star_dot", typed=typed)
     def predict_tangent(
         time_step, time_step_dot, x_dot_i, v_dot_i, acceleration_i, acceleration_dot_i, v_star_i
     ) -> tuple[vector, vector]:
@@ -378,26 +374,15 @@ def integration_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
     def acceleration_adjoint(time_step: real, v_bar_i: vector) -> vector:
         return time_step * v_bar_i
 
-    @wp.kernel(module=integration_module(precision, False), enable_backward=False)
-    @typed.arrays
+    @typed.kernel(integration_module(precision, False), enable_backward=False)
     def collect_masses(order, m_bar, m_scene_bar):
         i = wp.tid()
         m_scene_bar[order[i]] = m_scene_bar[order[i]] + m_bar[i]
 
-    begin_adjoint = begin_adjoint_kernel(precision)
-    return by_name(sort, unsort, predict, predict_tangent, acceleration_adjoint, collect_masses, begin_adjoint)
-
-
-@cache
-def begin_adjoint_kernel(precision: Precision) -> Any:
-    real, vector = precision.real, precision.vector
-    adjoin_prediction = prediction_share(precision)
-    typed = TypesByName(real, {wp.int32: "order", vector: "v", wp.array(dtype=vector): "x_scene v_scene"})
-
     @particle_kernel(integration_module(precision, False), "x_bar v_bar n_bar m_bar rho_0_bar mu_bar time_step_bar")
     @typed
     def begin_adjoint(
-        order_i, time_step, v_i, v_star_i, x_scene_bar, v_scene_bar, time_step_bar_i
+        order_i, time_step, v_i, v_star_i, x_scene_bar: vectors, v_scene_bar: vectors, time_step_bar_i
     ) -> tuple[vector, vector, real, real, real, real, real]:
         no = real(0.0)
         x_bar = x_scene_bar[order_i]
@@ -405,4 +390,4 @@ def begin_adjoint_kernel(precision: Precision) -> Any:
         dt_bar = time_step_bar_i + adjoin_prediction(x_bar, v_bar, v_i, v_star_i, time_step)
         return x_bar, v_bar, no, no, no, no, dt_bar
 
-    return begin_adjoint
+    return by_name(sort, unsort, predict, predict_tangent, acceleration_adjoint, collect_masses, begin_adjoint)

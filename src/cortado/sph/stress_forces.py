@@ -86,16 +86,15 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient
-    summed = rubbing_sum(discretisation, sticks)
 
     typed = TypesByName(real, {vector: "x v foot turn bar", precision.matrix: "T", neighbourhood: "s"})
+    summed = rubbing_sum(discretisation, sticks, typed)
 
     @typed
     def wall_force(x_ij, v_ij, m_i, T_i, mu_i, control, least, foot, s) -> vector:
         return (-hold(x_ij, foot, least, s) / m_i) * (T_i * fall(x_ij, foot) + (control * mu_i) * v_ij)
 
     @summed(wall_force)
-    @typed
     def force(x_ij, v_ij, m_i, T_i, T_j, mu_i, mu_j, control, least, s) -> vector:
         return (-weight(x_ij, s) / m_i) * ((T_i + T_j) * x_ij + (control * (mu_i + mu_j)) * v_ij)
 
@@ -112,7 +111,6 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
 
     @tangent_of(force)
     @summed(wall_force_tangent, ahead=False, grows=force)
-    @typed
     def force_tangent(
         x_ij, x_dot_ij, v_ij, v_dot_ij, m_i, m_dot_i, T_i, T_j, T_dot_i, T_dot_j, mu_i, mu_j, mu_dot_i, mu_dot_j,
         control, least, s,
@@ -131,7 +129,6 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
         return z[0] * y, z[1] * y, z[2] * y, control * wp.dot(z, v_ij)
 
     @summed(wall_traction_back)
-    @typed
     def traction_back(x_ij, v_ij, m_i, m_j, bar_i, bar_j, control, least, s) -> tuple[vector, vector, vector, real]:
         z = -weight(x_ij, s) * (bar_i / m_i - bar_j / m_j)
         return z[0] * x_ij, z[1] * x_ij, z[2] * x_ij, control * wp.dot(z, v_ij)
@@ -144,7 +141,6 @@ def stress_sums(discretisation: Discretisation, sticks: bool) -> SimpleNamespace
         return x_part, (-w * control * mu_i) * u, -level * w / m_i
 
     @summed(wall_force_back)
-    @typed
     def force_back(
         x_ij, v_ij, m_i, m_j, T_i, T_j, mu_i, mu_j, bar_i, bar_j, control, least, s
     ) -> tuple[vector, vector, real]:
@@ -236,8 +232,7 @@ def trial_kernel(precision: Precision, law: Formula) -> Any:
     module = kernel_module(f"{law.topic}trial_{precision.name}")
     real, theta_type, apparent = precision.real, theta_of(precision, law.ranks), applied(law, precision, 3, module)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @TypesByName(real, {theta_type: "thetas"}).arrays
+    @TypesByName(real, {theta_type: "thetas"}).kernel(module, enable_backward=False)
     def trial(shear_rates, viscosities, thetas, found: wp.array3d(dtype=real)):
         k, p, t = wp.tid()
         found[k, p, t] = apparent(shear_rates[k], viscosities[p], thetas[t])

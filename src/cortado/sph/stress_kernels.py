@@ -32,10 +32,8 @@ are missing, because M then has no inverse. With the invariants I_2 and I_3 of M
 
     H = 3 I_3 / I_2 (in 2-D 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
-H is 1 inside, about 0.6 at a flat surface and 0 on a line. Where S > 0, det M is at least 0.008: M has an inverse.
-
-Users' functions may take velocity gradients S G, with sums over fluid alone. Walls without slip are in
-`cortado.sph.stress_forces`.
+Where S > 0, det M is at least 0.008: M has an inverse. Users' functions may take velocity gradients S G, with sums
+over fluid alone.
 """
 
 from collections.abc import Callable
@@ -138,11 +136,11 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
     slope_gradient, contact = pair_functions(discretisation).slope_gradient, contact_functions(discretisation)
     weight, fall, fall_change = contact.weight, contact.fall, contact.fall_change
     hold, hold_gradient = contact.hold, contact.hold_gradient
-    summed = rubbing_sum(discretisation, sticks)
     fluidity, matrix = fluidity_function(precision), precision.matrix
     cross_terms = cross_terms_function(precision)
 
     typed = TypesByName(real, {vector: "x v foot turn", neighbourhood: "s", matrix: "M A"})
+    summed = rubbing_sum(discretisation, sticks, typed)
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
@@ -167,7 +165,6 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
         return terms(hold(x_ij, foot, least, s), fall(x_ij, foot), v_ij, fluidity(mu_i))
 
     @summed(wall_moments)
-    @typed
     def moments(x_ij, v_ij, mu_i, mu_j, least, s) -> six:
         return terms(weight(x_ij, s), x_ij, v_ij, fluidity(mu_j))
 
@@ -180,7 +177,6 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
 
     @tangent_of(moments)
     @summed(wall_moments_tangent, ahead=False, grows=moments)
-    @typed
     def moments_tangent(x_ij, x_dot_ij, v_ij, v_dot_ij, mu_i, mu_j, mu_dot_i, mu_dot_j, least, s) -> six:
         w, w_dot = weight(x_ij, s), -s.volume * wp.dot(slope_gradient(x_ij, s), x_dot_ij)
         thin = fluidity(mu_j)
@@ -196,7 +192,6 @@ def moment_sums(discretisation: Discretisation, sticks: bool) -> Kernels:
         return x_part, w * pulled, -R_bar_i * w * square * thin * thin
 
     @summed(wall_moments_back)
-    @typed
     def moments_back(
         x_ij, v_ij, mu_i, mu_j, M_bar_i, M_bar_j, A_bar_i, A_bar_j, R_bar_i, R_bar_j, least, s
     ) -> tuple[vector, vector, real]:

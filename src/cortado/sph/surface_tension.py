@@ -34,7 +34,7 @@ from cortado.particles.neighbourhood import Discretisation
 from cortado.particles.pair_sums import adjoint_of, fluid_sum, tangent_of
 from cortado.particles.particle_kernels import sum_kernel, sum_kernels
 from cortado.particles.state import Layout
-from cortado.sph.curvature import CurvatureConstants, curvature_kernels, entries
+from cortado.sph.curvature import CurvatureConstants, curvature_kernels
 from cortado.sph.parts import Adjoints, Force, Setting, StepContext, Tangents
 
 PART = 2.0 / 3.0
@@ -106,9 +106,10 @@ class CurvatureTension:
     def __init__(self, discretisation: Discretisation, dimension: int, constants: CurvatureConstants, layout: Layout):
         self._kernels = curvature_kernels(discretisation, dimension)
         self._constants = {"spacing": constants.spacing, "depth": constants.depth, "per_width": 1.0 / constants.width}
-        kinds = entries(layout.precision)
+        real, vector, matrix = layout.precision.real, layout.precision.vector, layout.precision.matrix
+        kinds = dict.fromkeys("gqe", vector) | dict.fromkeys("BD", matrix) | dict.fromkeys("zwcab", real)
         self._of = layout.arrays(requires_grad=discretisation.taped, **kinds)
-        self._change = layout.arrays(**kinds, r=kinds["g"])
+        self._change = layout.arrays(**kinds, r=vector)
         self._dot, self._bar = ({f"{name}_{kind}": self._change[name] for name in kinds} for kind in ("dot", "bar"))
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:

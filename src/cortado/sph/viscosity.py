@@ -94,15 +94,13 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
     def wall_force(x_ij, v_ij, n_i, m_i, mu_i, k, s) -> vector:
         return (k * s.volume / (m_i * n_i) * mu_i) * phi_force(x_ij, v_ij, s)
 
-    @rubbing_sum(discretisation, sticks)(wall_force)
-    @typed
+    @rubbing_sum(discretisation, sticks, typed)(wall_force)
     def force(x_ij, v_ij, n_i, n_j, m_i, mu_i, mu_j, k, s) -> vector:
         weight = pair_viscosity(mu_i, mu_j) * reciprocal(n_j)
         return (k * s.volume / (m_i * n_i) * weight) * phi_force(x_ij, v_ij, s)
 
     @tangent_of(force)
-    @fluid_sum(discretisation, ahead=False)
-    @typed
+    @fluid_sum(discretisation, typed, ahead=False)
     def force_tangent(
         x_ij, x_dot_ij, v_ij, v_dot_ij, n_i, n_j, n_dot_i, n_dot_j, m_i, m_dot_i, mu_i, mu_j, mu_dot_i, mu_dot_j, k, s
     ) -> vector:
@@ -114,8 +112,7 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
         return (k * s.volume / (m_i * n_i * n_j)) * total
 
     @adjoint_of(force)
-    @fluid_sum(discretisation)
-    @typed
+    @fluid_sum(discretisation, typed)
     def force_adjoint(
         x_ij, v_ij, n_i, n_j, m_i, m_j, mu_i, mu_j, bar_i, bar_j, k, s
     ) -> tuple[vector, vector, real, real, real]:
@@ -137,7 +134,6 @@ def viscosity_kernels(discretisation: Discretisation, sticks: bool) -> Kernels:
 
 @cache
 def viscosity_term(discretisation: Discretisation) -> WallTerm:
-
     def made(d: Discretisation) -> Any:
         (real, vector, neighbourhood), phi = d.types, pairwise(d).force
         kinds = {vector: "x v acceleration", d.precision.pair: "constants", neighbourhood: "s"}

@@ -55,16 +55,14 @@ def solve_kernels(precision: Precision) -> SimpleNamespace:
     module = kernel_module(f"conjugate_gradients_{type_name(vector)}")
     typed = TypesByName(real, {vector: "r p y product", wp.int32: "count going active"})
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module, enable_backward=False)
     def begin(w, r, p, y, share):
         i = wp.tid()
         p[i] = r[i]
         y[i] = vector()
         share[i] = w[i] * wp.dot(r[i], r[i])
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module, enable_backward=False)
     def start(total, first, size, count, going, active):
         b = wp.tid()
         first[b] = total[b]
@@ -75,8 +73,7 @@ def solve_kernels(precision: Precision) -> SimpleNamespace:
             going[b] = 1
             wp.atomic_add(active, 0, 1)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module, enable_backward=False)
     def descend(particles: int, going, size, curvature, w, p, product, y, r, share):
         i = wp.tid()
         b = i // particles
@@ -88,16 +85,14 @@ def solve_kernels(precision: Precision) -> SimpleNamespace:
         r[i] = left
         share[i] = w[i] * wp.dot(left, left)
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module, enable_backward=False)
     def turn(particles: int, going, size, total, r, p):
         i = wp.tid()
         b = i // particles
         if going[b] == 1:
             p[i] = r[i] + (total[b] / size[b]) * p[i]
 
-    @wp.kernel(module=module, enable_backward=False)
-    @typed.arrays
+    @typed.kernel(module, enable_backward=False)
     def decide(tolerance: real, most: int, total, first, size, count, going, active):
         b = wp.tid()
         if going[b] == 0:
