@@ -38,7 +38,7 @@ import warp as wp
 from cortado.device.modules import Kernels, by_name
 from cortado.device.precision import Precision, TypesByName
 from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets, rest_volume
-from cortado.particles.neighbourhood import Discretisation, neighbourhood_type, pair_functions
+from cortado.particles.neighbourhood import Discretisation, pair_functions
 from cortado.particles.pair_sums import fluid_sum, tangent_of
 from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
@@ -133,13 +133,9 @@ def curvature_functions(precision: Precision, dimension: int, module: Any) -> Si
 @cache
 def curvature_sums(discretisation: Discretisation) -> SimpleNamespace:
     """A symmetric matrix is stored as its diagonal and its components yz, xz and xy."""
-    precision = discretisation.precision
-    real, vector = precision.real, precision.vector
-    neighbourhood, matrix = neighbourhood_type(precision), precision.matrix
-    pair, cross_terms = pair_functions(discretisation), cross_terms_function(precision)
+    (real, vector, neighbourhood), typed = discretisation.types, types_of(discretisation)
+    pair, cross_terms = pair_functions(discretisation), cross_terms_function(discretisation.precision)
     weight, slope, gradient, hessian_product = pair.weight, pair.slope, pair.gradient, pair.hessian_product
-
-    typed = TypesByName(real, {vector: "x e g r", neighbourhood: "s", matrix: "B D"})
 
     @wp.func
     def even_terms(a: vector, b: vector) -> vector:
