@@ -367,7 +367,6 @@ class Series(Frames):
         super().__init__({k: SensorMatch(sensor, row, weight, scale) for k, row in zip(steps, rows, strict=True)})
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` if the time step of the run differs from the time step of this loss."""
         other = time_steps[np.abs(time_steps - self.time_step) > 1e-6 * time_steps]  # rounded to float32
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"

@@ -91,7 +91,6 @@ class Snapshot(OnHost):
 
     @property
     def container(self) -> Container:
-        """The container of the scene."""
         return moment_of(self).evaluator().container
 
     def _field(self, name: str) -> np.ndarray:
@@ -223,7 +222,6 @@ class Frames:
 
     @property
     def fingerprint(self) -> str:
-        """Return a text that identifies the losses and their targets, for checkpoints."""
         return " ".join(f"{step}:{fingerprint(loss)}" for step, loss in sorted(self.losses.items()))
 
 
@@ -245,7 +243,6 @@ class SnapshotBatch(OnHost, Sequence[Snapshot]):
     colours: np.ndarray
     """Colours of the phases (batch, phases, 3) in linear RGB from 0 to 1."""
     moment: Moment | None = None
-    """State and parameters of the next step, as in `Snapshot.moment`."""
 
     def __repr__(self) -> str:
         particles = counted(len(self.state.positions) // len(self), "particle")

@@ -42,7 +42,6 @@ class Recorded:
 
     @property
     def fingerprint(self) -> str:
-        """Return a text that identifies the function and its constants, for resumed searches."""
         return f"{type(self).__qualname__} {code_words(self.function)}"
 
     @WARP

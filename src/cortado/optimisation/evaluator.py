@@ -56,7 +56,6 @@ class Record:
     gradient_norm: float
     """Euclidean norm of the gradient over all parameters."""
     parameters: Parameters
-    """Parameters at which the loss was evaluated."""
     replayed: bool
     """True if the evaluation comes from the checkpoint."""
     refused: int = 0

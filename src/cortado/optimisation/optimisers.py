@@ -98,11 +98,9 @@ class Adam:
         require_positive("epsilon", self.epsilon)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the learning rates do not match the parameters."""
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates with one gradient each, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         theta = Iterate(search)
         m, v, t = np.zeros_like(theta.x), np.zeros_like(theta.x), 0
@@ -146,11 +144,9 @@ class GradientDescent:
         require_fraction("momentum", self.momentum)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the learning rates do not match the parameters."""
         require_names("learning_rate", self.learning_rate, layout)
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates with one gradient each, and evaluate the last iterate."""
         learning_rate = search.layout.spread(self.learning_rate)
         at, before = Iterate(search), search.start
         for _ in range(search.iterations):
@@ -194,13 +190,11 @@ class LBFGS:
         keep_own(self, "scale")
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the scales do not match the parameters, or if past updates need too much memory."""
         require_names("scale", self.scale, layout)
         numbers = 2.0 * self.memory * layout.size + 11.0 * self.memory**2
         require({f"{self.memory:,} past updates": 8.0 * numbers}, "take fewer of them, by memory")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make at most `search.iterations` updates, each with one or more evaluations."""
         from scipy.optimize import minimize
 
         scale = search.layout.spread(self.scale)
@@ -307,12 +301,10 @@ class LineSearch:
         require_at_most("trials", self.trials, 1_000)
 
     def check(self, layout: ParameterLayout) -> None:
-        """Raise `InputError` if the scales do not match the parameters, or if the trials need too much memory."""
         require_names("scale", self.scale, layout)
         require({f"{self.trials:,} trials": 16.0 * self.trials * layout.size}, "take fewer trials")
 
     def minimise(self, search: Search) -> Outcome:
-        """Make `search.iterations` updates with one gradient each, and evaluate the last iterate."""
         scale, at, reach = search.layout.spread(self.scale), Iterate(search), 1.0
         along = np.zeros_like(at.x)
         for _ in range(search.iterations):

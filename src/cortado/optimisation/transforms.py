@@ -182,7 +182,6 @@ class Transformed(OtherParameters):
 
     @property
     def fingerprint(self) -> str:
-        """Return a text that identifies the problem and its coordinates."""
         return f"{self.problem.fingerprint}; coordinates {sorted(self.coordinates.items(), key=str)}"
 
     def parameters(self, u: Mapping[str, Any]) -> Arrays:
@@ -209,13 +208,11 @@ class Transformed(OtherParameters):
         return estimate(self, u, gradient, observe)
 
     def forward_pass(self, u: Mapping[str, Any]) -> "TransformedPass":
-        """Run the problem forward at coordinates u."""
         return TransformedPass(self.problem.forward_pass(self.parameters(u)), self.coordinates, u)
 
     def together(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None
     ) -> list[Estimate | DivergedError]:
-        """Estimate losses and gradients at several coordinates in one batch. See `Batchable.together`."""
         found = super().together(points, estimator)
         for u, one in zip(points, found, strict=True):
             if isinstance(one, Estimate):

@@ -198,7 +198,6 @@ class Video:
 
     @property
     def start(self) -> Mapping[str, np.ndarray]:
-        """Return the initial values of the calibrated parameters of camera and clock."""
         return {**self.calibration.start, **self._clock}
 
     @property
