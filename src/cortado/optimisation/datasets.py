@@ -155,8 +155,7 @@ class Sample:
 
 FIRST = ("initial_positions", "initial_velocities")
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
-"""Particle types of LagrangeBench. ``MORE_FLUID`` is the type of further phases, and ``KINDS`` is the number
-of types."""
+"""Particle types of LagrangeBench. ``MORE_FLUID`` is for further phases, ``KINDS`` is the number of types."""
 MARGIN = 3
 """Distance from the container to the bounds of the data set [spacings]. LagrangeBench treats all axes as periodic if
 one axis is periodic. Opposite walls must therefore be far apart."""

@@ -35,10 +35,7 @@ class Searched:
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) -> tuple[Linearised, bool]:
-    """Return the minimum of the sum of squares and True, or the lowest of ``trials`` points and False.
-
-    Jacobians are first estimated from runs. At the end, forward mode computes the Jacobian.
-    """
+    """Return the minimum of the sum of squares and True, or the lowest of ``trials`` points and False."""
     for _ in range(4):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, 9.0 / squares)  # a decrease of three standard errors
@@ -120,10 +117,8 @@ def next_point(
 
 
 def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tuple[Linearised, bool | None]:
-    """Check the derivatives. After a failed check, return finite differences over `REACH` standard errors.
-
-    The second result is None after a successful check, or else whether the differences converged.
-    """
+    """Replace wrong derivatives by finite differences over `REACH` standard errors. The second result is None for right
+    derivatives, or else whether the differences converged."""
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -169,10 +164,8 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: 
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Weights, axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """Return the point with a Jacobian of finite differences along the axes, and all points of the differences.
-
-    The point may lie on a kink. Of both one-sided differences and the central difference, the smallest is used.
-    """
+    """Return the point with a Jacobian of finite differences along the axes, and all points of the differences. Of both
+    one-sided differences and the central difference, the smallest is used, because the point may lie on a kink."""
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
         ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]

@@ -199,8 +199,7 @@ class LeastSquares:
         return [np.nan_to_num(predicted - measured, nan=0.0) for predicted, measured in each]
 
     def estimated(self, u: np.ndarray) -> Linearised:
-        """Return residuals and estimated Jacobians. Derivatives with respect to logarithms are finite differences,
-        because forward runs are cheaper than forward-mode runs."""
+        """Return residuals and Jacobians. Slopes along logarithms are cheap differences of forward runs."""
         positive = self.coordinates.by_logarithm
         at = self.linearised(u, np.flatnonzero(~positive))
         _, upper = self.coordinates.bounds
