@@ -46,7 +46,7 @@ ROUGHLY = 0.1
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: whether gradients are right, how long they are useful, and which estimator to use."""
+    """The result of `certify`: whether gradients are right and for how many steps, and which estimator to use."""
 
     particles: int
     steps: int

@@ -179,10 +179,9 @@ class LossHistory:
 
 def _change(loss: Loss, before: Snapshot, after: Snapshot) -> float:
     """Return the change of a loss to second order, from the mean of both adjoints, which avoids round-off."""
-    ends = (before, after)
-    old, new = (end.state.numpy(end.dimension) for end in ends)
+    old, new = (end.state.numpy(end.dimension) for end in (before, after))
     distance = {name: new[name] - old[name] for name in new} | {"colours": after.colours - before.colours}
-    bars = [loss.value_and_adjoint(end)[1] for end in ends]
+    bars = [loss.value_and_adjoint(end)[1] for end in (before, after)]
     beyond = {name for bar in bars for name in by_field(bar, before.dimension) if name not in distance}
     distance |= {name: after[name] - before[name] for name in beyond}
     return 0.5 * sum(float(slope(bar, distance)) for bar in bars)
@@ -289,9 +288,8 @@ class Consistency(ShortRepr):
     def _worst(self, distances: np.ndarray) -> np.ndarray:
         """Divide by the size of the differences. Both are the greatest numbers up to each sample step."""
         size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
-        worst = np.maximum.accumulate(distances, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.nan_to_num(worst / size, nan=np.inf, posinf=np.inf)
+            return np.nan_to_num(np.maximum.accumulate(distances, axis=1) / size, nan=np.inf, posinf=np.inf)
 
 
 def balanced(gradient: Arrays, directions: Arrays) -> Arrays:
@@ -324,8 +322,7 @@ def check_consistency(history: LossHistory, values: Arrays, gradient: Arrays, di
     for h in STEPS if so_far().disagreement < MODE_TOLERANCE else ():
         found.append(history.sides(values, along, h, losses))
         gap = so_far().gaps[-1, -1] if len(found) > 1 else np.inf
-        settled = gap < RESOLUTION / SLACK or (best < PLATEAU and gap > best)
-        if settled and so_far().differences_agree:
+        if (gap < RESOLUTION / SLACK or (best < PLATEAU and gap > best)) and so_far().differences_agree:
             break
         best = min(best, gap)
     return so_far()

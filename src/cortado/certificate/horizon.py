@@ -102,8 +102,7 @@ def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random:
 
 def growth(norms: np.ndarray, time_step: float) -> float:
     """Return the growth of an adjoint over all backward steps [e-folds], by a line fit to log ``norms``."""
-    steps = len(norms) - 1
-    total = np.hypot(norms[:, 0], norms[:, 1] / max(steps * time_step, 1e-300))[::-1]
+    total = np.hypot(norms[:, 0], norms[:, 1] / max((len(norms) - 1) * time_step, 1e-300))[::-1]
     there = np.flatnonzero(total > 0.0)
     if len(there) < 3:
         return 0.0
@@ -133,14 +132,9 @@ class Horizon(ShortRepr):
     """First-order change of nearest neighbours' distances by the perturbation (sample_steps,) [spacings]."""
 
     @property
-    def meaningful(self) -> np.ndarray:
-        """Mask (sample_steps,) of the sample steps at which the exact derivative is near the finite difference."""
-        return np.abs(self.exact - self.difference) <= WITHIN * np.maximum.accumulate(np.abs(self.difference))
-
-    @property
     def measured(self) -> int:
         """Last of two successive sample steps at which the exact derivative is useful, or 0."""
-        good = self.meaningful
+        good = np.abs(self.exact - self.difference) <= WITHIN * np.maximum.accumulate(np.abs(self.difference))
         there = np.flatnonzero(good & np.append(good[:1], good[:-1]))
         return int(self.sample_steps[there[-1]]) if there.size else 0
 

@@ -107,7 +107,7 @@ class Solved:
 
     def _worst(self, name: str, error: float) -> str:
         """Describe the component with the greatest error, if it is more than twice the parameter's ``error``."""
-        estimate, true = self.estimate[name], self.made.true_parameter(name)
+        estimate, true = self.estimate[name], self.made.task.true_parameters.get(name)
         names = component_names(self.made.task, name, estimate)
         if true is None or not 1 < len(names) == np.size(true) == np.size(estimate) <= MOST_NUMBERS or not np.all(true):
             return ""
@@ -155,7 +155,7 @@ class Solved:
         """Parameters with very many components are left out."""
         lines = []
         for name, value in self.estimate.items():
-            found: Iterable[Any] = [(_words(name), None, value, self.made.true_parameter(name))]
+            found: Iterable[Any] = [(_words(name), None, value, self.made.task.true_parameters.get(name))]
             if name in self.knots:
                 found = self._at_knots(name)
             elif np.size(value) > MOST_NUMBERS:
@@ -170,7 +170,7 @@ class Solved:
     def rows(self) -> Rows:
         rows, errors, start = Rows(), self.verdict.errors, self.made.search.parameters(self.made.start)
         for name, value in self.estimate.items():
-            unit, true = self.made.task.known[name].unit, self.made.true_parameter(name)
+            unit, true = self.made.task.known[name].unit, self.made.task.true_parameters.get(name)
             if name in self.knots:
                 for label, first, found, hidden in self._at_knots(name):
                     known = ("", "") if hidden is None else (written(hidden), f"{distance(found, hidden):.3%}")

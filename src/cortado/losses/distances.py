@@ -311,8 +311,7 @@ class SensorMatch:
         return self.weight * float((self._miss(end) ** 2).sum())
 
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
-        bar = 2.0 * self.weight * self._miss(end) / self.scale
-        return self.value(end), self.sensor.adjoint(end, bar)
+        return self.value(end), self.sensor.adjoint(end, 2.0 * self.weight * self._miss(end) / self.scale)
 
     def _miss(self, end: Snapshot) -> np.ndarray:
         found = value_of(self.sensor, end)

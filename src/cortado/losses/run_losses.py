@@ -216,8 +216,7 @@ class LossesByStep(dict[int, CheckedLoss]):
 
     def _check(self, ends: Mapping[int, Any]) -> None:
         if self._frames is not None:
-            end = next(iter(ends.values()))
-            self._frames.check(np.ravel(moment_of(end).parameters["time_step"]))
+            self._frames.check(np.ravel(moment_of(next(iter(ends.values()))).parameters["time_step"]))
 
     def quantities(self, scene: Callable[[], SensedScene]) -> dict[int, str]:
         sums = {step: one.summed(scene()) for step, one in self._sensors.items() if hasattr(one, "summed")}

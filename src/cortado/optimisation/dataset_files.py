@@ -163,7 +163,6 @@ def metadata(
         std = np.sqrt(np.maximum(squares / np.maximum(counts, 1) - mean**2, 0.0))
         # below the threshold [m] of LagrangeBench it is 1, as it becomes a divisor
         moments |= {f"{name}_mean": mean.tolist(), f"{name}_std": np.where(std < 1e-7, 1.0, std).tolist()}
-    gravity = {} if "forces.gravity" in table.vary else {"g_ext": list(scene.forces.gravity)}
     return {
         "case": scene.name,
         "solver": f"Cortado {__version__}, {scene.solver.kind}",
@@ -177,7 +176,7 @@ def metadata(
         "bounds": [[0.0, float(end)] for end in upper],
         "origin": origin.tolist(),
         "default_connectivity_radius": REACH * scene.discretisation.spacing,
-        **gravity,
+        **({} if "forces.gravity" in table.vary else {"g_ext": list(scene.forces.gravity)}),
         "seed": table.seed,
         "vary": dict(table.vary),
         "runs": runs,

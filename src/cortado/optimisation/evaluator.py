@@ -149,7 +149,6 @@ class Evaluator:
     refused: int = 0
     promises: Promises = field(default_factory=Promises)
     logged: int = 0
-
     left_out: int = 0
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
@@ -165,17 +164,14 @@ class Evaluator:
         self.updates += 1
 
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
-        found = self._next(vector, is_trial=False)
+        found = self.attempt(vector, is_trial=False)
         if found is None:
             said = f"Of the former run's evaluations, which {self.log.fate}, one has an infinite loss"
             raise InputError(f"{said}, but must have a finite one for this optimiser: give another checkpoint folder.")
         return found
 
-    def attempt(self, vector: Vector) -> tuple[float, Vector] | None:
+    def attempt(self, vector: Vector, is_trial: bool = True) -> tuple[float, Vector] | None:
         """Return the loss and its gradient. For a failed run, return None and log an infinite loss."""
-        return self._next(vector, is_trial=True)
-
-    def _next(self, vector: Vector, is_trial: bool) -> tuple[float, Vector] | None:
         replayed = self.logged < len(self.log)
         if replayed:
             evaluation = self._replay(vector)

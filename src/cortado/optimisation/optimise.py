@@ -147,10 +147,8 @@ def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[st
     for name, value in start.items():
         outside = (value < least[name]) | (value > most[name])
         if outside.any():
-            said = (
-                f"The start of '{name}' is outside of its bounds in {int(outside.sum())} of {outside.size} components"
-            )
-            raise InputError(f"{said}; start within the bounds, or widen them.")
+            said = f"{int(outside.sum())} of {outside.size} components; start within the bounds, or widen them"
+            raise InputError(f"The start of '{name}' is outside of its bounds in {said}.")
     return least, most
 
 
@@ -190,11 +188,10 @@ def evaluate(
         loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
-    loss = np.nan if loss_if_diverged is None else loss_if_diverged
 
     def point(values: Values) -> Point:
         require_table("a point", values, "{'gravity': value}")
-        return Point(values, estimator, loss, NO_RUN)
+        return Point(values, estimator, np.nan if loss_if_diverged is None else loss_if_diverged, NO_RUN)
 
     found = evaluated(problem, map(point, points), chosen, on_result=on_result)
     lost = {number: one.diverged for number, one in enumerate(found) if one.diverged is not None}
@@ -261,7 +258,6 @@ def optimise(
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = checked_start(start)
     layout = ParameterLayout(tuple(values), tuple(array.shape for array in values.values()))
-    vector = layout.ravel(values)
     lower, upper = map(layout.ravel, checked_bounds({} if bounds is None else bounds, values))
     algorithm.check(layout)
     if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
@@ -272,11 +268,10 @@ def optimise(
     identity["problem"] = str(getattr(differentiable, "fingerprint", ""))
     if resume and checkpoint is None:
         raise InputError("resume=True needs the checkpoint folder of the run to resume; give checkpoint=...")
-    own_log = MemoryLog() if checkpoint is None else ReplayLog(checkpoint, layout, identity, resume)
-    with closing(own_log) as log:
+    with closing(MemoryLog() if checkpoint is None else ReplayLog(checkpoint, layout, identity, resume)) as log:
         evaluator = Evaluator(differentiable, gradient, layout, start, log, on_iteration)
         functions = evaluator, evaluator.attempt, evaluator.losses
-        search = Search(*functions, layout, vector, lower, upper, iterations, evaluator.count_update)
+        search = Search(*functions, layout, layout.ravel(values), lower, upper, iterations, evaluator.count_update)
         outcome = algorithm.minimise(search)
     why = ["refused " + counted(evaluator.refused, "step")] * bool(evaluator.refused)
     why += [f"left {counted(evaluator.left_out, 'run')} out of its averages"] * bool(evaluator.left_out)

@@ -40,8 +40,7 @@ class ParameterLayout:
         return sum(self.sizes)
 
     def ravel(self, parameters: Mapping[str, Any]) -> Vector:
-        parts = [np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names]
-        return np.concatenate(parts)
+        return np.concatenate([np.asarray(parameters[name], dtype=np.float64).ravel() for name in self.names])
 
     def unravel(self, vector: Vector) -> dict[str, Vector]:
         """Return copies of the parameters in a vector (size,), by name. Scalar parameters become arrays of shape ()."""

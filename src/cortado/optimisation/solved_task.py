@@ -78,7 +78,7 @@ def knot_values(made: Setup, coordinates: Arrays, estimate: Mapping[str, np.ndar
     found = {}
     for name, bijector in made.search.coordinates.items():
         if isinstance(bijector, TimeInterpolation):
-            true = made.true_parameter(name)
+            true = made.task.true_parameters.get(name)
             if true is not None:
                 rank = made.task.known[name].rank
                 course = np.broadcast_to(true, (bijector.steps, *np.shape(true)[np.ndim(true) - rank :]))
@@ -121,7 +121,7 @@ def task_figures(made: Setup, result: Result, folder: Path) -> TaskFigures:
 
 
 def _parameter(made: Setup, result: Result, name: str, folder: Path) -> Figures:
-    estimate, true = made.search.parameters(result.parameters)[name], made.true_parameter(name)
+    estimate, true = made.search.parameters(result.parameters)[name], made.task.true_parameters.get(name)
     path, first = folder / f"{name}.png", np.asarray(made.search.parameters(made.start)[name])
     names = component_names(made.task, name, estimate)
     if name in made.task.known.over_time and np.ndim(estimate) == 2:

@@ -115,10 +115,9 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, k
 
 
 def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
-    allowed = parameter.range
-    if is_too_small(array, allowed):
-        raise SceneError(None, field, float(array.min()), allowed.value)
-    if allowed is Range.FRACTIONS:
+    if is_too_small(array, parameter.range):
+        raise SceneError(None, field, float(array.min()), parameter.range.value)
+    if parameter.range is Range.FRACTIONS:
         row = int(np.abs(array.sum(axis=1) - 1.0).argmax())
         if abs(array[row].sum() - 1.0) > SUM_TOLERANCE:
             raise SceneError(None, f"{field}[{row}]", array[row].tolist(), "fractions that add up to 1")
@@ -253,9 +252,6 @@ class Setup:
         assert self.renderer is not None
         return self.renderer.render(end.state.positions, end.state.mass_fractions, end.colours)
 
-    def true_parameter(self, name: str) -> np.ndarray | None:
-        return self.task.true_parameters.get(name)
-
 
 def setup(task: Task, device: str, precision: str) -> Setup:
     simulation = Simulation(task.scene, device, precision)
@@ -280,8 +276,7 @@ def setup(task: Task, device: str, precision: str) -> Setup:
     free = [name for name in with_zero if name not in settings.logarithmic]
     bounds: dict[str, tuple[Any, Any]] = dict.fromkeys(free, (0.0, None))
     for name, (lower, upper) in (settings.bounds or {}).items():
-        is_log = name in settings.logarithmic
-        bounds[name] = (np.log(lower), np.log(upper)) if is_log else (lower, upper)
+        bounds[name] = (np.log(lower), np.log(upper)) if name in settings.logarithmic else (lower, upper)
     coordinates = searches[-1].coordinate(start)
     for name, (lower, upper) in bounds.items():
         coordinates[name] = np.clip(coordinates[name], lower, upper)  # what is random, or a little outside by round-off

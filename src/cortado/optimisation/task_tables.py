@@ -196,8 +196,7 @@ class ProblemTable(Table):
             if self.also:
                 raise field_error(("also",), list(self.also), "left out, as nothing is measured")
             return self._check_target()
-        others = {"loss", "distance", "frames", "target", "picture"} & self.model_fields_set
-        for name in sorted(others):
+        for name in sorted({"loss", "distance", "frames", "target", "picture"} & self.model_fields_set):
             raise field_error((name,), Words("given"), "left out, as there is measured data")
         names = [one.name for one in self.measured]
         for k, name in enumerate(names):

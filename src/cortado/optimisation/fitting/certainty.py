@@ -51,8 +51,7 @@ class Products:
         flat = J.transpose(0, 2, 1).reshape(-1, J.shape[1])
         scores = (flat @ r.T).reshape(F, -1, F)
         S = np.einsum("fpk,gqk->fgpq", scores, scores, optimize=True) / F
-        K = (flat @ flat.T).reshape(F, J.shape[2], F, -1).transpose(0, 2, 1, 3)
-        return cls(S, K, r @ r.T)
+        return cls(S, (flat @ flat.T).reshape(F, J.shape[2], F, -1).transpose(0, 2, 1, 3), r @ r.T)
 
 
 @dataclass(frozen=True)

@@ -126,10 +126,9 @@ def explained(
     before = Linearised(np.zeros(free), at.residuals, jacobians)
 
     def step() -> Linearised:
-        N_inverse = inverse(wide, hessian(wide, before, weights))
         white, slopes = (weighted(wide.parts, weights, own) for own in (before.residuals, before.jacobians))
         score: np.ndarray = sum(np.einsum("fmp,fm->p", J, r) for J, r in zip(slopes, white, strict=True))
-        u = -N_inverse @ score
+        u = -inverse(wide, hessian(wide, before, weights)) @ score
         each = zip(before.residuals, before.jacobians, strict=True)
         return replace(before, u=u, residuals=[r + J @ u for r, J in each])
 
@@ -156,8 +155,7 @@ def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list
     values, found = problem.coordinates.values(at.u), list[str]()
 
     def by_density(experiment: Experiment, own: Arrays) -> Arrays:
-        direction = {"rest_density": experiment.simulation.parameters()["rest_density"]}
-        _, slopes = experiment.linearised(own, [direction])
+        _, slopes = experiment.linearised(own, [{"rest_density": experiment.simulation.parameters()["rest_density"]}])
         problem.runs, problem.tangents = problem.runs + 1, problem.tangents + 1
         return {name: slope[..., 0] for name, slope in slopes.items()}
 

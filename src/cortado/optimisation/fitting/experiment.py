@@ -181,8 +181,7 @@ class Experiment:
         found = {}
         for name, one in self.observations.items():
             own = self._own(name, parameters)
-            read = {step: one.value(ends[step], own) for step in frames[name].needed}
-            found[name] = frames[name].between(read)
+            found[name] = frames[name].between({step: one.value(ends[step], own) for step in frames[name].needed})
             if found[name].shape != one.measured.shape:
                 said = f"{name} measured {one.measured.shape} numbers"
                 raise InputError(f"{said}, but the simulation has {found[name].shape}.")

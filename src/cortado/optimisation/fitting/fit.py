@@ -200,9 +200,8 @@ class Fit:
             said = "The fit was pickled without its experiments"
             raise InputError(f"{said}, which are needed to compute how likely other parameters are.")
         lower, upper = self.coordinates.bounds
-        root = np.linalg.cholesky(self.hessian)
         wanted = np.linalg.cholesky(np.linalg.inv(self.coordinate_covariance))
-        shortened = self.u + np.linalg.solve(root.T, wanted.T @ (point - self.u))
+        shortened = self.u + np.linalg.solve(np.linalg.cholesky(self.hessian).T, wanted.T @ (point - self.u))
         if not (np.isfinite(point) & (lower <= point) & (point <= upper)).all():
             return -np.inf
         try:
@@ -341,9 +340,8 @@ def fit(
                 found = other
             if starts is None and not (found.in_doubt and elsewhere(found, tried)):
                 break  # a fit without doubts, or all have the same end
-        doubts = (*found.doubts, *other_valleys(found, tried))
         spent = replace(found, runs=problem.runs, tangents=problem.tangents, refused=problem.refused)
-        found = replace(spent, tried=tuple(tried), doubts=doubts)
+        found = replace(spent, tried=tuple(tried), doubts=(*found.doubts, *other_valleys(found, tried)))
     if not found.doubts:
         return found
     assert found.at is not None

@@ -141,8 +141,7 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray
     """Return uncorrelated displacements of `REACH` standard errors, as columns of a matrix (free, free)."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
-    logarithmic = problem.coordinates.by_logarithm
-    longest = np.abs(axes[logarithmic]).max(axis=0, initial=TINY)
+    longest = np.abs(axes[problem.coordinates.by_logarithm]).max(axis=0, initial=TINY)
     return np.asarray(axes * np.minimum(1.0, GREATEST_LOGARITHM / longest))
 
 

@@ -277,8 +277,7 @@ class TrialPoints:
         x = np.array(self._points) @ self._metric.T  # the first Jacobian is orthonormal in these coordinates
         parts = [np.array(part) for part in zip(*self._residuals, strict=True)]
         flat = [part.reshape(len(x), -1) / scale for part, scale in zip(parts, self._scales, strict=True)]
-        products = np.sum([part @ part.T for part in flat], axis=0)
-        weights = self._metric.T @ slope_weights(x, products, number)
+        weights = self._metric.T @ slope_weights(x, np.sum([part @ part.T for part in flat], axis=0), number)
         jacobians = [np.tensordot(part, weights, (0, 1)) for part in parts]
         return Linearised(self._points[number], self._residuals[number], jacobians)
 
