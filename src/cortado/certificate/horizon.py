@@ -188,7 +188,6 @@ class Judged:
 
     @property
     def merit(self) -> float:
-        """Cosine times the ratio of the smaller norm to the larger norm. A perfect gradient has the merit 1."""
         return self.cosine * min(self.size, 1.0 / self.size) if self.size > 0.0 else 0.0
 
 

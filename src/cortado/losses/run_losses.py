@@ -123,8 +123,7 @@ class BatchedLoss(Protocol):
         """Return the losses (batch,). The loss of a diverged scene is arbitrary."""
 
     def values_and_adjoint(self, end: SnapshotBatch) -> tuple[np.ndarray, State]:
-        """Return the losses (batch,) and the derivatives with respect to the states, as Warp arrays. To make them, call
-        ``end.state.like()`` for zeros, and then ``set({"positions": array})`` with an array (batch, n, d)."""
+        """Return the losses (batch,) and derivatives as a state of Warp arrays. ``end.state.like()`` makes zeros."""
 
 
 class CheckedBatchedLoss(CheckedLoss):

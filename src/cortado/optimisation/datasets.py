@@ -223,7 +223,6 @@ def _walls(simulation: Simulation, motions: Mapping[str, SolidMotion], frames: i
 
 
 def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) -> dict[str, Any]:
-    """Return statistics of differences of positions (frames, n, d), and the greatest coordinates (d,) [m]."""
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         found = f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis}"

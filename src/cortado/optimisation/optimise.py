@@ -31,10 +31,8 @@ from cortado.optimisation.search import MemoryLog, Optimiser, ParameterLayout, R
 from cortado.scene.parameter_values import Values, require_points
 
 LossFunction = Callable[[dict[str, Any]], tuple[Any, Mapping[str, Any]]]
-"""A function that maps parameters by name to the loss and its gradient by name."""
 Bounds = Mapping[str, tuple[Any, Any]]
 MOST_ITERATIONS = 10_000_000
-"""Greatest number of updates that a search may have."""
 
 
 @dataclass(frozen=True)

@@ -363,7 +363,6 @@ class FitTables(Table):
 
 
 def file_schema() -> dict[str, Any]:
-    """Return the JSON schema of scenes, tasks and data sets."""
     schemas = [model.model_json_schema() for model in (Scene, TaskTables, FitTables, DatasetTables)]
     tables = {name: table for schema in schemas for name, table in schema["$defs"].items()}
     for table in tables.values():

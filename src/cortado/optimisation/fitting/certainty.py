@@ -56,10 +56,8 @@ class Products:
 
 @dataclass(frozen=True)
 class ScoreCovariance:
-    """The covariance of the score, which is the transposed Jacobian times the noise."""
-
     B: np.ndarray
-    """Covariance of the score (p, p)."""
+    """Covariance (p, p) of the score, which is the transposed Jacobian times the noise."""
     products: Products
     lost: float
     """Mean fraction of the covariance that the fit removes from the residuals."""
