@@ -237,6 +237,7 @@ def optimise(
             ``optimise(problem, start, "adam", learning_rate=0.1, iterations=50)``.
 
     A step is refused if its run diverges or if a parameter is out of range. The optimiser then takes a shorter step.
+    After a refusal, Adam and gradient descent also shorten all later steps.
     `Result.refused` counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
 
     Raises InputError for unsuitable ``start``, ``bounds`` or settings, and for a checkpoint of another run. Raises

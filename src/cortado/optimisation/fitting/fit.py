@@ -281,7 +281,8 @@ def fit(
 ) -> Fit:
     """Fit parameters to measured experiments by least squares, with error bars.
 
-    A residual is a simulation's prediction minus the measured number. The first fit weights all residuals equally, and
+    A residual is a simulation's prediction minus the measured number. Each Jacobian takes one run for each fitted
+    number. The first fit weights all residuals equally, and
     its residuals determine the weights of a second fit. The residuals of the second fit determine the error bars (see
     `cortado.optimisation.fitting.certainty`).
 
