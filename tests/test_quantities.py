@@ -13,13 +13,8 @@ from scenes import Squares, jet, plane, scene, simulated, two_layers
 from test_moving_solids import ROTOR
 
 PROJECTION = {"kind": "projection", "time_step": 0.0021}
-SCENES = {
-    "plane": plane,
-    "space": scene,
-    "two fluids": two_layers,
-    "jet": jet,
-    "projection": lambda: plane(solver=PROJECTION),
-}
+SCENES = {"plane": plane, "space": scene, "two fluids": two_layers, "jet": jet}
+SCENES["projection"] = lambda: plane(solver=PROJECTION)
 
 SIZES = [1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7]
 
@@ -48,7 +43,7 @@ def problem_of(make, name, steps=6, precision="float64", seed=0):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("make", SCENES.values(), ids=SCENES)
 def test_the_gradient_of_a_quantity_is_that_of_forward_mode_and_of_differences(make, name):
-    problem, point, along = problem_of(make, name)
+    problem, point, along = problem_of(make, name, steps=4)
     _, derivative = both_modes(problem, point, along, 1e-11)
     assert distance(problem.value, point, along, derivative, SIZES, enough=1e-6) < 1e-6
 
@@ -56,8 +51,8 @@ def test_the_gradient_of_a_quantity_is_that_of_forward_mode_and_of_differences(m
 @pytest.mark.parametrize("make", [SCENES["plane"], SCENES["projection"]])
 def test_a_loss_of_several_quantities_has_the_sum_of_their_gradients(make):
     """Of a pressure and a speed: the adjoint of velocities at the start of a step is none of the forces in it."""
-    problem, point, along = problem_of(make, "pressure")
-    both = cortado.Problem(problem.simulation, 6, Squares({**problem.loss.weights, "speed": 1e4}))
+    problem, point, along = problem_of(make, "pressure", steps=3)
+    both = cortado.Problem(problem.simulation, 3, Squares({**problem.loss.weights, "speed": 1e4}))
     _, derivative = both_modes(both, point, along, 1e-11)
     assert distance(both.value, point, along, derivative, SIZES, enough=1e-6) < 1e-6
 
@@ -72,9 +67,9 @@ def test_in_float32_the_gradient_is_near_that_of_float64(make, name):
     assert np.linalg.norm(found["gravity"] - wanted["gravity"]) < bound * np.linalg.norm(wanted["gravity"])
 
 
-@pytest.mark.parametrize("name", ["pressure", "vorticity", "wall_force"])
-def test_each_scene_of_a_batch_has_its_own(name):
-    problem, point, _ = problem_of(plane, name)
+def test_each_scene_of_a_batch_has_its_own():
+    problem, point, _ = problem_of(plane, "pressure", steps=4)
+    problem.loss.weights |= {"vorticity": 1e3, "wall_force": 1.0}
     batch = cortado.Problem(problem.simulation.batch_of(2), problem.steps, problem.loss)
     other = {**point, "gravity": 0.7 * point["gravity"]}
     both = {key: np.stack([point[key], other[key]]) for key in point}
@@ -161,19 +156,19 @@ def test_a_trajectory_is_looked_at_frame_by_frame():
     simulation = cortado.Simulation(plane(), precision="float64")
     gravity = np.linspace(-9.0, -1.0, 7)[:, None] * [0.0, 1.0]
     trajectory = simulation.run(7, {"gravity": gravity}, record_every=3)
+    ends = cortado.Problem(simulation, 7, Squares(dict.fromkeys(NAMES, 1.0))).states({"gravity": gravity}, [0, 3, 6, 7])
     for name in NAMES:
         found = simulation.quantity(name, trajectory, {"gravity": gravity})
         assert found.shape == (4, *QUANTITIES[name].shape(simulation.particles, 2))
-        ends = cortado.Problem(simulation, 7, Squares({name: 1.0})).states({"gravity": gravity}, [0, 3, 6, 7])
         for own, end in zip(found, ends.values(), strict=True):
             np.testing.assert_array_equal(own, end[name])
         assert simulation.quantity(name, trajectory[:0]).shape[0] == 0
 
 
-@pytest.mark.parametrize("make", [plane, scene, two_layers])
+@pytest.mark.parametrize("make", [plane, two_layers])
 def test_recorded_quantities_are_those_of_the_states_and_change_no_other_bit(make, tmp_path):
     simulation = cortado.Simulation(make(), precision="float64")
-    bare, found = simulation.run(6, record_every=2), simulation.run(6, record_every=2, record=NAMES)
+    bare, found = simulation.run(4, record_every=2), simulation.run(4, record_every=2, record=NAMES)
     assert np.array_equal(bare.positions, found.positions) and not bare.quantities
     for name in NAMES:
         np.testing.assert_array_equal(found.quantity(name), simulation.quantity(name, found))
@@ -188,12 +183,11 @@ def test_recorded_quantities_are_those_of_the_states_and_change_no_other_bit(mak
     np.testing.assert_array_equal(simulation.run(1, state=read.last_state).positions[0], found.positions[-1])
 
 
-@pytest.mark.parametrize("tables", [{}, {"solver": PROJECTION, "solid": [ROTOR]}], ids=["alone", "beside a rotor"])
-def test_recorded_quantities_of_a_batch_are_those_of_its_scenes(tables):
-    simulation = cortado.Simulation(plane(**tables))
-    found = simulation.batch_of(2).run(4, {"gravity": [[[0.0, -9.81]], [[1.0, -5.0]]]}, record=["pressure"])
+def test_recorded_quantities_of_a_batch_beside_a_rotor_are_those_of_its_scenes():
+    simulation = cortado.Simulation(plane(solver=PROJECTION, solid=[ROTOR]), precision="float64")
+    found = simulation.batch_of(2).run(2, {"gravity": [[[0.0, -9.81]], [[1.0, -5.0]]]}, record=["pressure"])
     for own, gravity in zip(found, ([0.0, -9.81], [1.0, -5.0]), strict=True):
-        alone = simulation.run(4, {"gravity": gravity}, record=["pressure"])
+        alone = simulation.run(2, {"gravity": gravity}, record=["pressure"])
         np.testing.assert_array_equal(own.quantity("pressure"), alone.quantity("pressure"))
 
 
@@ -229,8 +223,7 @@ def test_the_pictures_of_a_run_are_coloured_by_what_was_not_recorded_too(tmp_pat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(TINY_SCENE)
     main(["run", "scene.toml", "--steps", "2", "--no-pictures", "--out", "run"])
-    sizes = ["--set", "picture.width=160", "--set", "picture.height=120"]
+    small = [word for key in ("width=64", "height=64", "quality=quick") for word in ("--set", f"picture.{key}")]
     for name in ("phase", "speed", "pressure"):
-        main(["picture", "run", "--out", f"{name}.png", *sizes, "--set", f"picture.colour={name}"])
-        plain = (tmp_path / "phase.png").read_bytes()
-        assert ((tmp_path / f"{name}.png").read_bytes() == plain) == (name == "phase")
+        main(["picture", "run", "--out", f"{name}.png", *small, "--set", f"picture.colour={name}"])
+    assert len({(tmp_path / f"{name}.png").read_bytes() for name in ("phase", "speed", "pressure")}) == 3
