@@ -128,6 +128,12 @@ def jax():
 
 
 @pytest.fixture
+def unpacked(monkeypatch):
+    """Water beside solids begins on its lattice: to pack a few particles takes longer than to simulate them."""
+    monkeypatch.setattr(packing.Packing, "packed", lambda _, particles, stays: (particles, np.arange(len(particles))))
+
+
+@pytest.fixture
 def unrendered(request, monkeypatch):
     """Figures are made, but saved as a white square: to render them takes longer than all else that such tests are
     about, and is what tests/test_figures.py does. Tests that ask for `rendered` too have them as they are."""
