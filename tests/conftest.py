@@ -17,6 +17,7 @@ from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from cortado.device.threads import CORES, usable_cores
 from cortado.discretise import packing
+from cortado.scene import discrete_scene
 from short import is_slow, seconds_of, short
 from skips import complaints, reason_of
 
@@ -32,6 +33,21 @@ gc.set_threshold(100_000, 20, 20)
 
 packing._packed = cache(packing._packed.__wrapped__)
 """All results are kept, not the last few: the same scenes come back in other tests."""
+WALLS = {}, discrete_scene.walls_of
+
+
+def walls_of(scene, lattice):
+    """Those of a scene, which many simulations of a file have, are found once, and nobody may write to them."""
+    known, found = WALLS
+    key = scene.computed_json(), type(scene.container).shortened
+    if key not in known:
+        known[key] = found(scene, lattice)
+        for array in vars(known[key]).values():
+            array.flags.writeable = False
+    return known[key]
+
+
+discrete_scene.walls_of = walls_of
 
 os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
 """Each worker of pytest has its share of the cores: threads beyond it wait for each other. What several cores do is
