@@ -25,10 +25,13 @@ WRONG |= {"a table of nothing": {"gravity": None}, "a path": Path(mkdtemp()), "a
 WRONG |= {"no finite number": float("inf"), "a complex number": 1j}
 
 
+SMALL = {"width": 64, "height": 64, "quality": "quick"}
+
+
 @cache
 def at():
     """What functions are called with, when all is well."""
-    made = SimpleNamespace(scene=cortado.Scene(**plane()), loss=losses.CentreOfMass([0.0, 0.0]))
+    made = SimpleNamespace(scene=cortado.Scene(**plane(picture=SMALL)), loss=losses.CentreOfMass([0.0, 0.0]))
     made.start = {"gravity": [0.0, -9.0]}
     made.simulation = cortado.Simulation(made.scene)
     made.problem = cortado.Problem(made.simulation, 2, made.loss)

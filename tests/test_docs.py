@@ -6,6 +6,7 @@ import runpy
 import shlex
 import shutil
 import tomllib
+from functools import cache
 from pathlib import Path
 from textwrap import dedent
 
@@ -109,13 +110,17 @@ def test_a_tutorial_is_short_and_ends_in_a_picture():
 
 def test_a_command_is_one(capsys):
     """It has the options that are written, and files that are named are there."""
-    for command in COMMANDS:
-        words = shlex.split(command, comments=True)
-        name = words[: 2 if words[0] == "gradients" else 1]
+
+    @cache
+    def told(*name):
         with pytest.raises(SystemExit) as end:
             main([*name, "--help"])
-        known = capsys.readouterr().out
-        assert end.value.code == 0, command
+        assert end.value.code == 0, name
+        return capsys.readouterr().out
+
+    for command in COMMANDS:
+        words = shlex.split(command, comments=True)
+        known = told(*words[: 2 if words[0] == "gradients" else 1])
         assert [word for word in words if word.startswith("--") and word not in known] == [], command
         files = [word for word in words if word.endswith(".toml") and "/" in word]
         assert [file for file in files if not (ROOT / file).exists()] == []
