@@ -4,6 +4,7 @@ import gc
 import math
 import os
 import shutil
+import warnings
 from collections import Counter
 from functools import cache
 from importlib.util import find_spec
@@ -13,11 +14,12 @@ import pytest
 from matplotlib.image import imsave
 
 from compiling_notice import FLAGS, compile_fast, without_compiling
+from cortado import simulation
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from cortado.device.threads import CORES, usable_cores
 from cortado.discretise import packing
-from cortado.scene import discrete_scene
+from cortado.scene.discrete_scene import discretise
 from short import is_slow, seconds_of, short
 from skips import complaints, reason_of
 
@@ -33,21 +35,26 @@ gc.set_threshold(100_000, 20, 20)
 
 packing._packed = cache(packing._packed.__wrapped__)
 """All results are kept, not the last few: the same scenes come back in other tests."""
-WALLS = {}, discrete_scene.walls_of
+PARTICLES = {}
 
 
-def walls_of(scene, lattice):
-    """Those of a scene, which many simulations of a file have, are found once, and nobody may write to them."""
-    known, found = WALLS
+def discretised(scene):
+    """The particles of a scene, which many simulations of a file have. They are made once, unless this warns or reads a
+    file."""
     key = scene.computed_json(), type(scene.container).shortened
-    if key not in known:
-        known[key] = found(scene, lattice)
-        for array in vars(known[key]).values():
-            array.flags.writeable = False
-    return known[key]
+    if key not in PARTICLES:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            found = discretise(scene)
+        for warning in told:
+            warnings.warn(warning.message, warning.category, stacklevel=4)
+        if told or "file=" in repr(scene):
+            return found
+        PARTICLES[key] = found
+    return PARTICLES[key]
 
 
-discrete_scene.walls_of = walls_of
+simulation.discretise = discretised
 
 os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
 """Each worker of pytest has its share of the cores: threads beyond it wait for each other. What several cores do is

@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cortado.discretise.shapes import Numbers, Points, Which, in_space, launch_on_cpu, pairs_within, shared
+from cortado.discretise.shapes import (
+    Numbers,
+    Points,
+    Which,
+    in_space,
+    launch_on_cpu,
+    pairs_within,
+    recorded_on_cpu,
+    shared,
+)
 from cortado.discretise.smoothing import SLACK, lattice_offsets, rest_volume
 from cortado.discretise.walls import RestLattice
 from cortado.files.terminal import timed_note
@@ -187,22 +196,27 @@ class Relaxation:
         arrays["own"] = np.empty((count, 3))
         for name, array in arrays.items():
             setattr(self._equations, name, shared(array))
-        self._launch(kernels.linearise, sums=self.sums, distances=distances, close=close, **self._given)
+        equations: dict[str, Any] = {"equations": self._equations}
+        given = {"sums": self.sums, "distances": distances, "close": close, **self._given, **equations}
+        recorded_on_cpu(kernels.linearise, count, **given)()
         self.distances = distances[: close_starts[-1]]
+        self._moves, self._changes = np.empty((count, 3)), np.empty(count)
+        self._approaches = np.empty_like(self.distances)
+        given = equations | {"moves": self._moves, "changes": self._changes, "approaches": self._approaches}
+        self._multiply, self._multiply_back = (
+            recorded_on_cpu(kernel, count, **given) for kernel in (kernels.multiply, kernels.multiply_back)
+        )
 
     def multiply(self, moves: Points) -> tuple[Points, Points]:
         """Return the changes of `sums` (n,) and of `distances` (m,) for moves (n, 3) [m]."""
-        changes, approaches = np.zeros_like(self.sums), np.empty_like(self.distances)
-        self._launch(self._around.kernels.multiply, moves=moves, changes=changes, approaches=approaches)
-        return changes, approaches
+        self._moves[:], self._changes[:] = moves, 0.0
+        self._multiply()
+        return self._changes.copy(), self._approaches.copy()
 
     def multiply_back(self, changes: Points, approaches: Points) -> Points:
-        moves = np.zeros((len(changes), 3))
-        self._launch(self._around.kernels.multiply_back, moves=moves, changes=changes, approaches=approaches)
-        return moves
-
-    def _launch(self, kernel: Any, **arguments: Any) -> None:
-        launch_on_cpu(kernel, len(self.sums), in_bands=False, equations=self._equations, **arguments)
+        self._moves[:], self._changes[:], self._approaches[:] = 0.0, changes, approaches
+        self._multiply_back()
+        return self._moves.copy()
 
 
 MOST_LOOKS, MOST_ROUNDS = 12, 36

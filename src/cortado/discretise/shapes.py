@@ -1,10 +1,10 @@
 """Arrays of points in float64: lattices in boxes and discs, pairs of neighbours, and the density of points."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import product
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -296,18 +296,30 @@ def _in_bands() -> Any:
     return BandLauncher(wp.get_device("cpu"))
 
 
-def launch_on_cpu(kernel: Any, threads: int, in_bands: bool = True, **arguments: Any) -> None:
-    """Arguments may be NumPy arrays. With ``in_bands``, no two threads may write to the same element."""
-    from cortado.device.launching import launch
+def launch_on_cpu(kernel: Any, threads: int, **arguments: Any) -> None:
+    """Arguments may be NumPy arrays. No two threads may write to the same element."""
     from cortado.device.threads import WARP
 
     if threads:
         with WARP:
-            given = {name: shared(x) if isinstance(x, np.ndarray) else x for name, x in arguments.items()}
-            if in_bands:
-                _in_bands()(kernel, threads, **given)
-            else:
-                launch(kernel, threads, _in_bands().device, **given)
+            _in_bands()(kernel, threads, **_shared(arguments))
+
+
+def recorded_on_cpu(kernel: Any, threads: int, **arguments: Any) -> Callable[[], None]:
+    """Return a function that launches a kernel with these arguments, which may be NumPy arrays. Repeated launches are
+    cheaper than by `launch_on_cpu`, but use one core."""
+    from cortado.device.launching import recorded
+    from cortado.device.threads import WARP
+
+    if not threads:
+        return lambda: None
+    with WARP:
+        launch = recorded(kernel, threads, _in_bands().device, **_shared(arguments))
+    return cast(Callable[[], None], WARP(launch))
+
+
+def _shared(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: shared(x) if isinstance(x, np.ndarray) else x for name, x in arguments.items()}
 
 
 def shared(values: NDArray[Any], dtype: Any = None) -> Any:

@@ -2,11 +2,12 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from cortado.device.grid import Grid
-from cortado.discretise.smoothing import lattice_offsets, rest_volume
+from cortado.discretise.smoothing import SmoothingKernel, lattice_offsets, rest_volume
 from cortado.scene.discrete_scene import DiscreteScene
 from cortado.scene.scene import Scene
 
@@ -34,10 +35,9 @@ class ProjectionConstants:
         return [self.relaxation / float(middle - half * root) for root in roots]
 
 
-def lattice_constants(scene: Scene, discrete: DiscreteScene) -> ProjectionConstants:
+@cache
+def lattice_constants(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> ProjectionConstants:
     """The relaxation factor makes the Jacobi iteration stable for the stiffest pressure wave on the rest lattice."""
-    kernel, spacing, dimension = discrete.kernel, scene.discretisation.spacing, scene.dimension
-    support = discrete.lattice.support
     offsets = lattice_offsets(spacing, support, dimension)
     volume = rest_volume(kernel, spacing, support, dimension)
     gradients = volume * kernel.gradient(offsets, support)

@@ -273,6 +273,7 @@ class Maker:
             return Pcisph(system, None)
         if batch is not None and table.tolerance is not None:
             raise InputError(f"batch is {batch}, but must be left out, as solver.tolerance is that of one scene.")
-        grid = coarse_grid(setting.scene, setting.discrete, system.layout.particles)
-        constants = lattice_constants(setting.scene, setting.discrete)
-        return Projection(system, table, constants, grid, endless(setting.discrete))
+        scene, discrete = setting.scene, setting.discrete
+        grid, lattice = coarse_grid(scene, discrete, system.layout.particles), discrete.lattice
+        constants = lattice_constants(discrete.kernel, scene.discretisation.spacing, lattice.support, scene.dimension)
+        return Projection(system, table, constants, grid, endless(discrete))
