@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import product
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -315,7 +315,7 @@ def recorded_on_cpu(kernel: Any, threads: int, **arguments: Any) -> Callable[[],
         return lambda: None
     with WARP:
         launch = recorded(kernel, threads, _in_bands().device, **_shared(arguments))
-    return cast(Callable[[], None], WARP(launch))
+    return WARP(launch)
 
 
 def _shared(arguments: Mapping[str, Any]) -> dict[str, Any]:
