@@ -14,7 +14,7 @@ FLUME = names_of("wave_flume.py")
 OWN = ["--hull", "hull.csv", "--draught", "0.15", "--at", "1", "--centre", "0.12", "--gyration", "0.14"]
 
 
-@pytest.mark.parametrize(("period", "hinge"), [(0.897, 0.1), (1.158, 0.0), (1.5, 0.1)])
+@pytest.mark.parametrize(("period", "hinge"), [(0.897, 0.1), (1.158, 0.0)])
 def test_a_steady_flap_makes_the_waves_of_its_transfer_function(period, hinge):
     """A flap with a hinge at the floor or above it (Dean and Dalrymple 1991, section 6.3), far from it."""
     omega, depth = 2.0 * np.pi / period, FLUME["DEPTH"]
@@ -24,7 +24,7 @@ def test_a_steady_flap_makes_the_waves_of_its_transfer_function(period, hinge):
     arm, kd = depth - hinge, k * depth
     lever = np.sinh(kd) + (np.cosh(k * hinge) - np.cosh(kd)) / (k * arm)
     wanted = 2.0 * np.sinh(kd) / (0.5 * np.sinh(2.0 * kd) + kd) * lever
-    times = np.arange(0.0, 16.0, 0.01)
+    times = np.arange(0.0, 16.0, 0.02)
     stroke = 0.01 * np.minimum(times / 4.0, 1.0) * np.sin(omega * times)
     found, late = FLUME["theory"](times, stroke, np.array([3.0]), hinge=hinge)[:, 0], times > 11.0
     assert abs(FLUME["swing"](times[late], found[late], period)) / 0.01 == pytest.approx(wanted, rel=0.01)
@@ -60,7 +60,7 @@ def test_a_flap_and_a_hull_of_ones_own_need_no_measurements(monkeypatch, own_cas
     monkeypatch.setitem(FLUME["read"].__globals__, "SHORTEST", 0.05)
     monkeypatch.setitem(FLUME["LinearFlume"].__init__.__globals__, "COARSE", 0.1)
     monkeypatch.setitem(FLUME["LinearFlume"].__init__.__globals__, "HIGHEST", 1.2)
-    few = ["--deep", "10", "--long", "4", "--begin", "0", "--end", "0.1", "--probes", "0.5", "3", "1.6"]
+    few = ["--deep", "10", "--long", "4", "--begin", "0", "--end", "0.05", "--probes", "0.5", "3", "1.6"]
     monkeypatch.setattr(sys, "argv", ["wave_flume.py", "flap.csv", *OWN, *few])
     FLUME["main"]()
     said = capsys.readouterr().out
