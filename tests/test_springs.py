@@ -66,7 +66,7 @@ def test_a_damped_block_comes_to_rest_at_its_rate(rate):
 
 def test_the_force_in_a_spring_is_stiffness_times_extension():
     mass = DENSITY * SIDE**2
-    run, _ = bobbing(hung(preload=2.0 * mass), 300)
+    run, _ = bobbing(hung(preload=2.0 * mass), 150)
     read, extension = run.sensors["line"], 3.0 - run.solids["block"].positions[:-1, 1]
     wanted = np.stack([mass * (2.0 + RATE**2 * extension), 1.0 + extension], axis=1)
     np.testing.assert_allclose(read.values[: len(wanted)], wanted, rtol=1e-12)
@@ -77,12 +77,12 @@ def test_a_slack_line_only_pulls():
     body = block(2, velocity=[0.0, 2.0])
     line = {"name": "line", "solid": "block", "point": [0.5, 3.0], "anchor": [0.5, 4.0], "slack": True}
     line |= {"stiffness": DENSITY * SIDE**2 * RATE**2}
-    simulation = Simulation(plane(body, spring=[line], **ALONE), precision="float64")
-    run = simulation.run(1500, record_every=1, sensors={"line": SpringForce("line")})
+    scene = plane(body, spring=[line], solver={"kind": "projection", "time_step": 0.002}, **ALONE)
+    run = Simulation(scene, precision="float64").run(720, record_every=1, sensors={"line": SpringForce("line")})
     force, speeds = run.sensors["line"].values[:, 0], run.solids["block"].velocities[:, 1]
     free = run.solids["block"].positions[:, 1] > 3.0 + 1e-9
-    assert force.min() == 0.0 and force.max() > 100.0 and free[1:400].all()
-    np.testing.assert_allclose(np.diff(speeds)[:400], -9.81e-3, rtol=1e-9)
+    assert force.min() == 0.0 and force.max() > 100.0 and free[1:200].all()
+    np.testing.assert_allclose(np.diff(speeds)[:200], -9.81 * 0.002, rtol=1e-9)
     again = speeds[np.nonzero(np.diff(free.astype(int)) > 0)[0][1]]
     assert again == pytest.approx(2.0, rel=0.01)
 
@@ -92,8 +92,9 @@ def test_two_blocks_on_a_spring_keep_their_momenta():
     bodies = block(2, velocity=[0.3, 0.1]), block(2, "other", (1.5, 3.0), angular_velocity=2.0)
     spring = {"name": "line", "solid": "block", "to": "other", "point": [0.55, 3.02], "anchor": [1.45, 3.07]}
     spring |= {"stiffness": 200.0, "rest_length": 0.7, "damping": 3.0}
-    scene = plane(*bodies, spring=[spring], forces={"gravity": [0.0, 0.0]}, **ALONE)
-    run = Simulation(scene, precision="float64").run(1000, record_every=50)
+    solver = {"kind": "projection", "time_step": 0.005}
+    scene = plane(*bodies, spring=[spring], forces={"gravity": [0.0, 0.0]}, solver=solver, **ALONE)
+    run = Simulation(scene, precision="float64").run(200, record_every=20)
     one, other = run.solids["block"], run.solids["other"]
     momentum = one.velocities + other.velocities
     assert np.abs(momentum - [0.3, 0.1]).max() < 1e-13 and np.abs(one.velocities - [0.3, 0.1]).max() > 0.15
@@ -157,13 +158,11 @@ def test_the_force_in_a_spring_has_derivatives(scene_of, table, springs):
     random = np.random.default_rng(3)
     along = {n: sizes.get(n.split(".")[-1], 0.3) * random.normal(size=np.shape(v)) for n, v in point.items()}
     simulation = Simulation(scene, precision="float64")
-    point["initial_velocities"] = (
-        0.1 * thrown(simulation)["initial_velocities"]
-    )  # at rest it is on corners of the clamp
+    moved = 0.1 * thrown(simulation)["initial_velocities"]  # at rest it is on corners of the clamp
+    point["initial_velocities"] = moved
     problem = Problem(simulation, 6, loss)
-    for name, change in along.items():
-        both_modes(problem, point, {name: change})
-    tangent = both_modes(problem, point, along)[1]
+    gradient, tangent = both_modes(problem, point, along)
+    assert all(np.abs(gradient[name]).max() > 0.0 for name in along)
     assert distance(problem.value, point, along, tangent, decades(3.0, 7.0), enough=1e-6) < 1e-6
 
 
@@ -212,7 +211,7 @@ def test_a_motor_follows_the_torques_and_speeds_of_a_file(tmp_path):
     """A damper of the rate 50 / s brings the block to a speed that grows by 6 rad / s2, 6 / 50 rad / s late."""
     file = tmp_path / "motor.csv"
     file.write_text("time [s],speed [rpm],torque [N m]\n0.0,0.0,0.0\n1.0,57.2957795,0.0\n")
-    times, _, spins = turning(file=str(file), damping=50.0 * ABOUT)
+    times, _, spins = turning(501, file=str(file), damping=50.0 * ABOUT)
     assert spins[500] == pytest.approx(6.0 * (times[500] - 0.02), rel=2e-3)
     with pytest.raises(SceneError, match=r"hinge\[0\]\.torque is 1\.0, but must be left out, as there is a file"):
         turning(file=str(file), damping=1.0, torque=1.0)
@@ -226,7 +225,7 @@ def test_a_block_hangs_on_an_arm_that_moves_and_turns():
     arm = box([0.8, 2.95], [0.9, 3.05], name="arm", motion="path", velocity=[0.3, 0.1], angular_velocity=2.0)
     pin = {"name": "pin", "solid": "block", "to": "arm", "position": [0.65, 3.0], "damping": 100.0 * ABOUT}
     scene = plane(block(2), arm, hinge=[{**pin, "speed": 1.0}], forces={"gravity": [0.0, 0.0]}, **ALONE)
-    run = Simulation(scene, precision="float64").run(500, record_every=1)
+    run = Simulation(scene, precision="float64").run(150, record_every=1)
     places = [
         run.solids[name].positions
         + way * np.stack([np.cos(run.solids[name].rotations), np.sin(run.solids[name].rotations)], axis=1)
