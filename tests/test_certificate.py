@@ -174,7 +174,6 @@ def test_a_sign_flipped_is_found_in_float32(name, monkeypatch):
 
 
 def test_a_wrong_adjoint_of_a_loss_is_found_in_float32():
-    assert not certify(Problem(Simulation(plane()), 8, Spread(sign=-1.0))).right
     assert not certify(Problem(Simulation(plane()), 8, Spread(sign=1.2))).right
 
 
@@ -366,15 +365,16 @@ def losing(monkeypatch, step, is_copy):
 
 def test_beyond_the_step_in_which_a_moved_copy_loses_a_particle_there_is_no_answer(monkeypatch, tmp_path):
     """But before it there is the same one."""
-    whole = certify(problem_of(plane(), 30))
-    losing(monkeypatch, 20, lambda _, values: np.abs(np.ravel(values["gravity"])[1] + 9.81) > 0.1)
-    found = certify(problem_of(plane(), 30))
+    whole = certify(problem_of(plane(), 16), ["gravity"])
+    losing(monkeypatch, 11, lambda _, values: np.abs(np.ravel(values["gravity"])[1] + 9.81) > 0.1)
+    found = certify(problem_of(plane(), 16), ["gravity"])
     (horizon,), (wanted,) = found.horizons, whole.horizons
-    assert found.right and found.horizon == 19 and found.consistency.last_converged == 30
-    np.testing.assert_array_equal(horizon.difference[:15], wanted.difference[:15])
-    assert horizon.sample_steps[14] <= 19 and np.isnan(horizon.difference[horizon.sample_steps > 19]).all()
-    sentence = "Beyond step 19 there is no answer for gravity: a run that the perturbation of gravity moves loses"
-    assert sentence in str(found) and "Up to step 19 of 30" in str(found) and found.estimator != "Exact()"
+    assert found.right and found.horizon == 10 and found.consistency.last_converged == 16
+    seen = horizon.sample_steps <= 10
+    np.testing.assert_array_equal(horizon.difference[seen], wanted.difference[seen])
+    assert seen.sum() > 5 and np.isnan(horizon.difference[~seen]).all()
+    sentence = "Beyond step 10 there is no answer for gravity: a run that the perturbation of gravity moves loses"
+    assert sentence in str(found) and "Up to step 10 of 16" in str(found) and found.estimator != "Exact()"
     json.dumps(found.as_dict(), allow_nan=False)
     assert gradient_check(found, tmp_path / "certificate.png").stat().st_size
 

@@ -446,7 +446,7 @@ def wedge(gap, **tables):
     return pool([0.4, 0.6], [1.1, 1.0], 0.03, solid=[disc], solver={"kind": "projection", **CHOSEN}, **tables)
 
 
-def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter():
+def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(unpacked):
     simulation = Simulation(wedge(0.012))
     whole = simulation.run(65)
     sizes = sizes_of(whole)
