@@ -96,11 +96,11 @@ def test_work_that_says_that_it_takes_long_is_no_hang(tmp_path):
 
 def test_much_memory_is_found_and_not_that_of_this_process(tmp_path):
     usual = call(lambda: None, ("test",), tmp_path).memory
-    assert judged(tmp_path, lambda: None, Limits(memory=usual + 100_000_000)) == []
-    found = judged(tmp_path, partial(hold, 300_000_000), Limits(memory=usual + 100_000_000))
+    assert judged(tmp_path, lambda: None, Limits(memory=usual + 50_000_000)) == []
+    found = judged(tmp_path, partial(hold, 100_000_000), Limits(memory=usual + 50_000_000))
     assert len(found) == 1 and "held" in found[0]
-    held = np.ones(400_000_000, dtype=np.uint8)
-    assert call(lambda: None, ("test",), tmp_path).memory < 300_000_000 < len(held)
+    held = np.ones(100_000_000, dtype=np.uint8)
+    assert call(lambda: None, ("test",), tmp_path).memory < usual + len(held) // 2
 
 
 def trajectory_of(positions, at=0.3):
