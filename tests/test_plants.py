@@ -62,7 +62,7 @@ SHARED = {
 """Derivatives that forward mode uses too, and those of pictures, so that only differences can tell."""
 ELSEWHERE = {
     "environments.kernels": "of rewards, which are no losses of these scenes: tests/test_environments.py",
-    "sph.parts.begin_adjoint_kernel.begin_adjoint": "for solvers from outside: tests/test_solver.py",
+    "sph.parts.integration_kernels.begin_adjoint": "for solvers from outside: tests/test_solver.py",
     "solvers.projection.mean_stress": "of quantities that no loss of these scenes sees: tests/test_energy_budget.py",
 }
 """Modules with functions of adjoints that no plant is in, and single such functions, and why."""
