@@ -68,8 +68,6 @@ def near_air(scene: Scene, found: DiscreteScene) -> np.ndarray:
 CASES = {
     "disc": (2, [DISC], None, AREA),
     "ball": (3, [BALL], None, 4.0 / 3.0 * np.pi * 0.125),
-    "cylinder": (3, [CYLINDER], None, VOLUME),
-    "cup": (3, [CYLINDER], CUP, VOLUME),
     "cup that lies": (3, [CYLINDER | {"axis": "x"}], CUP | {"axis": "x"}, VOLUME),
     "full cup": (3, [CUP], CUP, np.pi * 0.25 * 0.8),
     "open cup": (3, [CYLINDER], CUP | {"lid": False}, VOLUME),
@@ -140,7 +138,7 @@ def test_packed_particles_are_the_same_every_time_and_few_move():
 def test_small_bodies_have_the_particles_that_fit():
     one = discretise(scene_of(3, [CYLINDER | {"radius": 0.025, "height": 0.05}])).fluid.positions
     np.testing.assert_allclose(one, [[0.0, 0.025, 0.0]], atol=1e-9)
-    for radius in (0.04, 0.06, 0.1, 0.14):
+    for radius in (0.04, 0.1, 0.14):
         found = discretise(scene_of(2, [DISC | {"radius": radius}])).fluid.positions
         assert abs(len(found) - np.pi * radius**2 / SPACING**2) <= 1.0
         assert np.isfinite(found).all()
@@ -149,12 +147,12 @@ def test_small_bodies_have_the_particles_that_fit():
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_round_solid_in_a_tank_leaves_layers_along_its_walls_whole(dimension):
     """There was a hole along the last wall before: all particles of flat faces counted as if they were round."""
-    upper, middle = [3.0, 1.0, 0.4][:dimension], [0.9, 0.53, 0.2][:dimension]
+    upper, middle = [1.2, 0.8, 0.4][:dimension], [0.43, 0.4, 0.2][:dimension]
     ball = {"name": "ball", "shape": "sphere", "centre": middle, "radius": 0.16}
     tank = {"shape": "box", "lower": [0.0] * dimension, "upper": upper}
-    found = discretise(bodies(dimension, [tank], {**tank, "upper": [upper[0], 1.2, *upper[2:]]}, solid=[ball]))
-    layers = np.bincount((found.fluid.positions[:, 0] / SPACING).astype(int), minlength=60)
-    assert len(layers) == 60 and (layers[30:] == 20 * 8 ** (dimension - 2)).all()
+    found = discretise(bodies(dimension, [tank], {**tank, "upper": [upper[0], 1.0, *upper[2:]]}, solid=[ball]))
+    layers = np.bincount((found.fluid.positions[:, 0] / SPACING).astype(int), minlength=24)
+    assert len(layers) == 24 and (layers[13:] == 16 * 8 ** (dimension - 2)).all()
     surface = {2: 2.0 * np.pi * 0.16, 3: 4.0 * np.pi * 0.16**2}[dimension]
     lacking = np.prod(upper) - surface * 0.16 / dimension - layers.sum() * SPACING**dimension
     assert abs(lacking) < 0.15 * surface * SPACING
@@ -193,7 +191,7 @@ def test_derivatives_of_densities_and_distances(dimension):
     assert transposed == pytest.approx(changes @ a + approaches @ b, rel=1e-12)
 
 
-MAJOR, MINOR = 0.3, 0.15
+MAJOR, MINOR = 0.2, 0.1
 BAR = {"shape": "box", "lower": [0.2, 0.3], "upper": [0.7, 0.5]}
 CAN = {"shape": "cylinder", "base": [0.5, 0.2, 0.4], "radius": 0.2, "height": 0.4}
 TRIANGLE = {"shape": "polygon", "corners": [[0.0, 0.0], [0.6, 0.0], [0.3, 0.7]]}

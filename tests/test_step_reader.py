@@ -1,6 +1,6 @@
 """Sensors that are read on the device beside what they read of the same states on the host."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from test_riding_sensors import MADE, on_a_solid
 from test_sensors import IN_SPACE, IN_THE_PLANE, ROUND_THE_EDGE, channel
 from test_time_steps import CHOSEN, SOLVERS, drop
 
+pytestmark = pytest.mark.usefixtures("unpacked")
 LOADED = {"load": SolidLoad("rotor"), "gauge": WaveGauge([0.5, 0.0]), "walls": WallForce()}
 LOADED |= {"flow": FlowRate([0.5, 0.0], [1.0, 0.3])}
 RIDDEN = {f"on a {on} in {d}-D": (partial(make, d), on_a_solid(d, on)) for make, on in MADE.values() for d in (2, 3)}
@@ -33,7 +34,13 @@ CASES = {
     "chosen": (lambda: drop({**SOLVERS["projection"], **CHOSEN}), dict(list(IN_THE_PLANE.items())[:-1])),
     "nozzle": (jet, {"gauge": WaveGauge([0.2, 0.0]), "flow": FlowRate([0.0, 0.2], [0.0, -1.0])}),
 }
-STEPS = 21
+STEPS = 11
+"""More than the 8 that are taken together."""
+
+
+@cache
+def simulated(name, precision="float32", batch=None):
+    return cortado.Simulation(CASES[name][0](), precision=precision, batch=batch)
 
 
 class Doubled(PressureProbe):
@@ -45,7 +52,7 @@ class Doubled(PressureProbe):
 
 def test_a_sensor_made_from_another_reads_its_own_values():
     probes = {"one": PressureProbe([0.2, 0.1]), "two": Doubled([0.2, 0.1])}
-    read = cortado.Simulation(plane(), precision="float64").run(3, sensors=probes).sensors
+    read = simulated("plane", "float64").run(3, sensors=probes).sensors
     np.testing.assert_allclose(read["two"].values, 2.0 * read["one"].values, rtol=1e-13)
 
 
@@ -56,7 +63,7 @@ class OnHost:
         self.columns, self.value, self.adjoint = sensor.columns, sensor.value, sensor.adjoint
 
 
-def readings(run, name="values"):
+def readings(run):
     return {sensor: own.values for sensor, own in run.sensors.items()}
 
 
@@ -65,8 +72,7 @@ def readings(run, name="values"):
     [*((name, "float64") for name in CASES), *((name, "float32") for name in ("projection", "rotor"))],
 )
 def test_readings_are_those_of_the_same_states_on_the_host(name, precision):
-    make, sensors = CASES[name]
-    simulation = cortado.Simulation(make(), precision=precision)
+    simulation, sensors = simulated(name, precision), CASES[name][1]
     found = simulation.run(STEPS, sensors=sensors)
     wanted = simulation.run(STEPS, sensors={name: OnHost(sensor) for name, sensor in sensors.items()})
     assert found.positions.tobytes() == wanted.positions.tobytes()
@@ -79,11 +85,10 @@ def test_readings_are_those_of_the_same_states_on_the_host(name, precision):
 
 @pytest.mark.parametrize("name", ["projection", "rotor", "on a tank in 2-D", "on a raft in 2-D"])
 def test_each_scene_of_a_batch_has_the_readings_of_its_own_run(name):
-    make, sensors = CASES[name]
-    gravities = np.array([[[0.0, -9.81]], [[3.0, -5.0]]])
-    batch = cortado.Simulation(make(), batch=2).run(STEPS, {"gravity": gravities}, sensors=sensors)
+    gravities, sensors = np.array([[[0.0, -9.81]], [[3.0, -5.0]]]), CASES[name][1]
+    batch = simulated(name, batch=2).run(STEPS, {"gravity": gravities}, sensors=sensors)
     for gravity, together in zip(gravities, batch, strict=True):
-        alone = cortado.Simulation(make()).run(STEPS, {"gravity": gravity[0]}, sensors=sensors)
+        alone = simulated(name).run(STEPS, {"gravity": gravity[0]}, sensors=sensors)
         for sensor, values in readings(alone).items():
             np.testing.assert_array_equal(together.sensors[sensor].values, values, sensor)
 
@@ -126,7 +131,7 @@ OF_LOSSES = {"projection": PROBE, "plane": PROBE, "rotor": SolidLoad("rotor"), "
 def test_losses_of_sensors_take_no_step_again_and_have_the_same_bits(name, batch, monkeypatch):
     solve, solved = QuantityEvaluator._solve, []
     monkeypatch.setattr(QuantityEvaluator, "_solve", lambda *given: (solved.append(1), solve(*given))[1])
-    made, found = cortado.Simulation(CASES[name][0](), precision="float64", batch=batch), []
+    made, found = simulated(name, "float64", batch), []
     for sensor in (OF_LOSSES[name], OnHost(OF_LOSSES[name])):
         problem, point = judged(made, sensor), {"gravity": made.parameters()["gravity"] + 0.1}
         solved.clear()
