@@ -22,7 +22,7 @@ COMMANDS = {
     "new": ("dam.toml", "template drop, dimension 3"),
     "examples": ("", "copy first_gradient, to there"),
     "describe": (
-        "scene.toml --json --set picture.film_frames=0",
+        "scene.toml --json --set picture.film_frames=0 --set picture.width=128 --set picture.height=72",
         "steps 7, time 0.1, record-every 3, fps 9, picture a.png, set solver.time_step=0.001, device cuda:99, "
         "precision float64",
     ),
@@ -38,7 +38,7 @@ COMMANDS = {
         "scheduler tcp://127.0.0.1:1",
     ),
     "picture": (
-        "run",
+        "run --set picture.width=128 --set picture.height=72 --set picture.film_frames=3",
         "frame 0, film --out film.webp, lines 90, camera orbit, colour speed, out b.png, set picture.width=100, "
         "device cuda:99",
     ),

@@ -187,7 +187,7 @@ def test_usd_has_the_rate_that_was_asked_for(tmp_path, rate, step, every):
         {**ROTOR, "name": "fan", "motion": "path", "angular_velocity": [0.0, 0.0, 25.0]},
     ]
     marks, of = Marks(0.0, rate), scene_from_dict({**scene().model_dump(exclude_none=True), "solid": solids})
-    times, first = recorded(step, marks, 1.0), lattice()
+    times, first = recorded(step, marks, 0.5), lattice()
     there = np.stack([np.interp(times, knots, way), *np.outer([0.15, 0.1], np.ones(len(times)))], axis=1)
     still, turns = np.tile([0.55, 0.15, 0.1], (len(times), 1)), np.outer(times, [0.0, 0.0, 25.0])
     motions = {"my rotor": SolidMotion(there, 0.0 * turns), "fan": SolidMotion(still, turns)}
@@ -195,7 +195,7 @@ def test_usd_has_the_rate_that_was_asked_for(tmp_path, rate, step, every):
     stage = usd.Stage.Open(str(run[::every].export(tmp_path / "usd", to="usd", scene=of)))
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == pytest.approx(rate / every, rel=1e-15)
     points = geometry.Points.Get(stage, "/run/particles").GetPointsAttr()
-    codes = np.arange(np.floor(rate / every + 1e-9) + 1)
+    codes = np.arange(np.floor(0.5 * rate / every + 1e-9) + 1)
     assert points.GetTimeSamples() == codes.tolist()
     for code in codes:
         time = code * every / rate

@@ -233,7 +233,7 @@ def test_a_fit_writes_its_numbers_and_its_report(task, tmp_path, cortado_command
     assert "Residuals" in report and "standard error" in report and "left gauge" in report
 
 
-def test_on_a_full_disk_a_fit_says_so(task, tmp_path, cortado_command, monkeypatch):
+def test_on_a_full_disk_a_fit_says_so(task, tmp_path, cortado_command, monkeypatch, unrendered):
     replace = os.replace
 
     def refuse(old, new, **options):
@@ -242,7 +242,8 @@ def test_on_a_full_disk_a_fit_says_so(task, tmp_path, cortado_command, monkeypat
         return replace(old, new, **options)
 
     monkeypatch.setattr(os, "replace", refuse)
-    code, _, err = cortado_command("fit", task, "--out", tmp_path / "run", "--set", "fit.profiles=0")
+    quick = [word for key in ("profiles=0", "starts=1", "iterations=1") for word in ("--set", f"fit.{key}")]
+    code, _, err = cortado_command("fit", task, "--out", tmp_path / "run", *quick)
     assert code == 1, err
     assert_one_sentence(err.removesuffix("\n").splitlines()[-1])
     assert "No space left on device" in err

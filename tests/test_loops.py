@@ -11,7 +11,7 @@ import pytest
 from cortado import CortadoWarning, InputError, Problem, Simulation, gradients, losses
 from layered import sheared
 
-STEPS = 6
+STEPS = 4
 PLACE = [0.3, 0.2]
 
 
@@ -41,8 +41,8 @@ def loop(layer, simulation, weights, state, gradient=None, spoilt=np.inf):
 
 # ---- smoothed ----------------------------------------------------------------------------------------------------
 ESTIMATORS = [
-    gradients.EnsembleMean(0.5, estimator=gradients.Exact()),
-    gradients.EnsembleMean(0.5),
+    gradients.EnsembleMean(0.5, 4, estimator=gradients.Exact()),
+    gradients.EnsembleMean(0.5, 4),
     gradients.Guided(0.5, seed=3),
     gradients.RandomizedSmoothing(0.5, samples=2, position_noise=0.02),
     gradients.AdjointViscosity(),
@@ -70,7 +70,7 @@ def test_a_loop_is_smoothed_as_the_problem_that_it_is(simulation, library, estim
 def test_in_float32_it_is_the_problem_to_round_off(jax, library):
     with jax.enable_x64(False):
         single = Simulation(sheared(), precision="float32")
-        layer, gravity, estimator = layer_of(library), np.array([0.4, -9.0]), gradients.EnsembleMean(0.5)
+        layer, gravity, estimator = layer_of(library), np.array([0.4, -9.0]), gradients.EnsembleMean(0.5, 4)
         smoothed = layer.smoothed(single, partial(loop, layer, single), estimator)
         found = smoothed.estimate({"g": gravity})
         wanted = Problem(single, STEPS, losses.CentreOfMass(PLACE)).estimate({"gravity": gravity}, estimator)
@@ -84,7 +84,7 @@ def test_its_value_is_the_mean_and_its_derivative_the_smoothed_gradient(jax, sim
 
     for library in ("jax", "torch"):
         layer = layer_of(library)
-        smoothed = layer.smoothed(simulation, partial(loop, layer, simulation), gradients.EnsembleMean(0.5))
+        smoothed = layer.smoothed(simulation, partial(loop, layer, simulation), gradients.EnsembleMean(0.5, 4))
         found = smoothed.estimate({"g": np.array([0.4, -9.0])})
         if library == "jax":
             value, own = jax.value_and_grad(lambda g, f=smoothed: 3.0 * f({"g": 2.0 * g}))(jax.numpy.array([0.2, -4.5]))
@@ -102,8 +102,8 @@ def test_it_begins_at_a_state_and_leaves_lost_loops_out(simulation):
     estimator = gradients.EnsembleMean(0.5, samples=10, estimator=gradients.Exact())
     later = layer.step(simulation, layer.state(simulation), steps=5)
     whole, begun = (
-        layer.smoothed(simulation, partial(loop, layer, simulation), estimator, state).estimate({"g": gravity})
-        for state in (None, later)
+        layer.smoothed(simulation, partial(loop, layer, simulation), gradients.Exact(), start).estimate({"g": gravity})
+        for start in (None, later)
     )
     assert begun.loss != whole.loss
     most = estimator.around(Problem(simulation, 1, losses.CentreOfMass(PLACE)), {"g": gravity})

@@ -14,7 +14,7 @@ from cortado.runs.frames import Marks
 from cortado.scene.restart import Clock
 from scenes import jet, plane, plane_of_three, pool_text, pour, two_layers
 
-FIRST, REST = 17, 24
+FIRST, REST = 9, 12
 MAKERS = {"plane": plane, "two layers": two_layers, "plane of three": plane_of_three, "jet": jet, "pour": pour}
 
 
