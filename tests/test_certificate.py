@@ -408,12 +408,6 @@ def test_the_copy_in_float64_may_lose_a_particle(monkeypatch):
         certify(problem)
 
 
-def test_what_was_not_tried_is_extrapolated():
-    rows = str(certify(problem_of(plane(), 12))).splitlines()
-    called = {name: "extrapolated" in next(row for row in rows if name in row) for name in ("gravity", "time_step")}
-    assert called == {"gravity": False, "time_step": True}
-
-
 def test_growth_is_in_e_folds():
     steps, dt = 100, 0.01
     back = steps - np.arange(steps + 1)

@@ -104,12 +104,12 @@ def no_progress(total):
 
 
 @pytest.mark.parametrize("name", ADAPTED)
-def test_an_experiment_measures_draws_and_judges(name, tmp_path):
+def test_an_experiment_measures_draws_and_judges(name, tmp_path, unrendered):
     experiment = load_experiment(EXPERIMENTS / f"{name}.toml", reduced=True, overrides=ADAPTED[name])
     settings = experiment.settings.model_copy(update={"scene": scene_from_dict(SCENE)})
     results = Results(tmp_path)
     sentences = results.measure(replace(experiment, settings=settings))
-    assert results.picture.stat().st_size > 20_000
+    assert results.picture.is_file()
     assert sentences and "nan" not in " ".join(sentences)
 
 
