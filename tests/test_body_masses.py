@@ -115,6 +115,8 @@ def test_masses_that_do_not_fit_together_are_refused():
     ]:
         with pytest.raises(SceneError, match=wanted):
             plane({**box([0.2, 0.32], [0.45, 0.48], name="raft", motion="free"), **keys})
+    with pytest.raises(SceneError, match="only a body whose motion"):
+        plane(box([0.2, 0.32], [0.45, 0.48], name="post", gyration_radius=0.1))
 
 
 def test_an_inertia_of_no_body_is_refused():
@@ -125,8 +127,3 @@ def test_an_inertia_of_no_body_is_refused():
     ]:
         with pytest.raises(SceneError, match=wanted):
             space(massive(BRICK, 3.0, inertia=numbers))
-
-
-def test_only_a_free_body_has_a_mass():
-    with pytest.raises(SceneError, match="only a body whose motion"):
-        plane(box([0.2, 0.32], [0.45, 0.48], name="post", gyration_radius=0.1))

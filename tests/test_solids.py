@@ -204,6 +204,7 @@ def test_a_bad_solid_is_a_sentence(table, sentence):
     ("solid", "words"),
     [
         ({"shape": "box", "lower": [-0.1, -0.1], "upper": [0.8, 0.8]}, r"fluid.0 has no particle"),
+        ({"shape": "plane", "position": [0.5, 2.0], "normal": [0.0, 1.0]}, r"fluid.0 has no particle"),
         ({"shape": "sphere", "centre": [5.0, 5.0], "radius": 0.2}, "solid 'solid 0' has no surface that fluid"),
     ],
 )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cortado import InputError, Scene, SceneError, Simulation
+from cortado import Scene, SceneError, Simulation
 from cortado.discretise.primitives import cut_box_faces
 from cortado.discretise.smoothing import KERNELS, SLACK
 from cortado.discretise.walls import RestLattice
@@ -266,11 +266,6 @@ def test_a_wrong_plane_is_a_sentence():
         with pytest.raises(SceneError) as error:
             scene([SLOPE | change], container=container)
         assert sentence in str(error.value) and "solid[0]" in str(error.value)
-
-
-def test_a_plane_in_front_of_all_of_the_fluid_is_said():
-    with pytest.raises(InputError, match=r"fluid.0 has no particle"):
-        discretise(scene([SLOPE | {"position": [0.5, 2.0]}]))
 
 
 def test_a_plane_is_in_pictures_as_far_as_the_container_goes_and_in_json():
