@@ -226,13 +226,6 @@ def test_a_file_that_has_changed_since_it_was_imported_is_refused(module, edited
         Body(made.push)
 
 
-def test_text_that_was_never_in_a_file_is_refused():
-    scope = {"wp": wp}
-    exec(PUSH, scope)
-    with pytest.raises(InputError, match="the text of Body function push is not to be found"):
-        Body(scope["push"])
-
-
 STRENGTH, AIM = 6.0, wp.vec3d(1.0, 0.0, 0.0)
 
 
