@@ -199,7 +199,7 @@ def test_pressures_are_sums_over_all_pairs_and_walls(name):
 
 def test_water_at_rest_has_the_pressure_of_its_depth():
     """Within 2 %, where the impulses over dt that they are made of are 4 % off."""
-    found = still_water(20, time=1.0)
+    found = still_water(20, time=0.7)
     assert found.pressure.all < 0.02 < 0.03 < found.multiplier.all
     assert found.pressure.inside < 0.02
     assert found.pressure.near_walls < 0.03
