@@ -4,7 +4,6 @@ import gc
 import math
 import os
 import shutil
-import warnings
 from collections import Counter
 from functools import cache
 from importlib.util import find_spec
@@ -14,12 +13,11 @@ import pytest
 from matplotlib.image import imsave
 
 from compiling_notice import FLAGS, compile_fast, without_compiling
-from cortado import simulation
 from cortado.cli import main
 from cortado.cli.subcommands import CORTADO
 from cortado.device.threads import CORES, usable_cores
 from cortado.discretise import packing
-from cortado.scene.discrete_scene import discretise
+from cortado.scene import discrete_scene
 from short import is_slow, seconds_of, short
 from skips import complaints, reason_of
 
@@ -35,26 +33,23 @@ gc.set_threshold(100_000, 20, 20)
 
 packing._packed = cache(packing._packed.__wrapped__)
 """All results are kept, not the last few: the same scenes come back in other tests."""
-PARTICLES = {}
 
 
-def discretised(scene):
-    """The particles of a scene, which many simulations of a file have. They are made once, unless this warns or reads a
-    file."""
-    key = scene.computed_json(), type(scene.container).shortened
-    if key not in PARTICLES:
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            found = discretise(scene)
-        for warning in told:
-            warnings.warn(warning.message, warning.category, stacklevel=4)
-        if told or "file=" in repr(scene):
-            return found
-        PARTICLES[key] = found
-    return PARTICLES[key]
+def once(make):
+    """What is made of a scene, which many simulations of a file have, is made once, unless it is read from a file."""
+    known = {}
+
+    def kept(scene, *others):
+        key = scene.computed_json(), type(scene.container).shortened
+        if "file=" in repr(scene):
+            return make(scene, *others)
+        return known[key] if key in known else known.setdefault(key, make(scene, *others))
+
+    return kept
 
 
-simulation.discretise = discretised
+for name in ("walls_of", "fluid_particles", "_settled"):
+    setattr(discrete_scene, name, once(getattr(discrete_scene, name)))
 
 os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
 """Each worker of pytest has its share of the cores: threads beyond it wait for each other. What several cores do is

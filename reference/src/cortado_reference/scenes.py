@@ -109,7 +109,8 @@ def _of_solver(scene: Scene, discrete: DiscreteScene) -> dict[str, Any]:
     """What the engine is told of the solver; without pressure both take the same step."""
     solver = scene.solver
     if isinstance(solver, ProjectionSolver):
-        constants = lattice_constants(scene, discrete)
+        spacing, support = scene.discretisation.spacing, discrete.lattice.support
+        constants = lattice_constants(discrete.kernel, spacing, support, scene.dimension)
         return {
             "projection": scene.forces.pressure,
             "maximum_iterations": solver.iterations,
