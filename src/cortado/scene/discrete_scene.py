@@ -258,8 +258,10 @@ def discretise(scene: Scene) -> DiscreteScene:
     if most := scene.discretisation.jitter * spacing:
         moved = fluid.positions + np.random.default_rng(0).uniform(-most, most, fluid.positions.shape)
         fluid = replace(fluid, positions=np.where(fluid.is_placed[:, None], fluid.positions, moved))
+    velocities = fluid.velocities.copy()
     for body, end, size in zip(scene.fluid, np.cumsum(fluid.sizes), fluid.sizes, strict=True):
-        fluid.velocities[end - size : end] = body.velocities(fluid.positions[end - size : end])
+        velocities[end - size : end] = body.velocities(fluid.positions[end - size : end])
+    fluid = replace(fluid, velocities=velocities)
     if any(isinstance(body, PointsFluid) for body in scene.fluid):
         of_lattice = kernel, support, lattice.volume, spacing
         told = check_crowding("the points of the fluid", fluid.positions, *of_lattice, scene.periods, fluid.names)
