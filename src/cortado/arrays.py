@@ -98,7 +98,7 @@ def require_function(what: str, value: Any, *arguments: str) -> None:
 
 
 def require_arguments(what: str, function: Callable[..., Any], wanted: tuple[str, ...], other: str = "") -> None:
-    """Raise `InputError` unless ``function`` takes the arguments ``wanted``. ``other`` ends the message."""
+    """Raise `InputError` unless ``function`` takes the arguments ``wanted``. The error message ends with ``other``."""
     if not callable(function) or isinstance(function, type):
         said = f"{what} is {shown(function)}"
         raise InputError(f"{said}, but must be a function of {', '.join(wanted) or 'nothing'}{other}.")

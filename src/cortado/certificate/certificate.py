@@ -185,7 +185,7 @@ def certify(
     if not isinstance(problem, Problem):
         if steps is None:
             found = type(problem).__name__
-            raise InputError(f"steps is left out, but must be given to certify what is no Problem but a {found}.")
+            raise InputError(f"steps is left out, but must be given to certify a {found}, which is not a Problem.")
         simulation = problem if isinstance(problem, Simulation) else Simulation(problem, precision="float64")
         problem = Problem(simulation, steps, FinalPositions(simulation.positions))
     elif steps is not None:

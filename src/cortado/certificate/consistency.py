@@ -222,7 +222,7 @@ class Consistency(ShortRepr):
     tangents: np.ndarray
     """Directional derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps). Empty if reverse and forward mode disagree."""
+    """Central differences (tried, sample_steps). They are not computed if reverse and forward mode disagree."""
     sides: np.ndarray
     """Distances (tried, sample_steps) between the forward and the backward difference, for each tried step size."""
     steps: np.ndarray

@@ -238,11 +238,11 @@ class Pages(io.RawIOBase):
 
 class TrajectoryWriter:
     """A context manager that writes frames to one VTKHDF file. The file appears at ``path`` after its first ``kept``
-    frames, and can be opened while it grows. Missing frames contain no particles."""
+    frames, and can be opened while it grows. Frames that are not written yet have no particles."""
 
     def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
-        """``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames, or else for
-        all."""
+        """``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames. By default it must
+        have room for all frames."""
         self.path, self._layout = Path(path), FileLayout(**fields)
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)

@@ -306,7 +306,7 @@ def image_sum_of_solid(total: Any) -> Any:
 
 
 def rubbing_sum(d: Discretisation, sticks: bool, typed: Typed) -> Callable[..., Decorator]:
-    """If fluid ``sticks`` to walls, the sums include walls without slip."""
+    """If ``sticks``, the sums include the friction of no-slip walls."""
 
     def summed(walls: Function, ahead: bool = True, grows: Any = None) -> Decorator:
         return pair_sum(d, typed, walls, ahead, rubs=True, grows=grows) if sticks else fluid_sum(d, typed, ahead)

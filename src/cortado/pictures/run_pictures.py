@@ -89,7 +89,7 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 def shown_run(
     trajectory: Trajectory, scene: Scene, settings: Settings, units: Any = None, simulation: Computed = None
 ) -> ShownRun:
-    """``simulation`` computes quantities for colours that were not recorded."""
+    """``simulation`` computes quantities that colours need and that the run did not record."""
     if not len(trajectory):
         raise InputError("The trajectory has no frames, but must have one to be filmed.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units

@@ -133,7 +133,7 @@ class CurvatureTension:
 
 
 RELAXED = {2: 1.1, 3: 1.25}
-"""Ratio of the surface tension after flow to the surface tension of a cut lattice, for each dimension."""
+"""Surface tension after the particles have moved, relative to particles on a lattice, for each dimension."""
 LEAST_SUPPORT = {"pairs": 1.8, "curvature": 2.5}
 """Smallest support radius for each kind of surface tension [spacings]."""
 LEAST_VISCOSITY = 0.05

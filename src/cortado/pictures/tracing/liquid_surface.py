@@ -86,7 +86,7 @@ REACH_OF_COLOURS = 2.25
 """Support radius of the kernel for the fluid's colour [spacings]."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
-"""Pairs of a greatest number of particles and the width of lattice cubes up to this number [spacings]."""
+"""Width of the lattice cubes [spacings], with the number of particles up to which the width applies."""
 WeightedLook = wp.types.vector(6, wp.float32)
 MOST_CELLS = 1 << 26
 """Greatest number of cells in the grid that finds near particles."""
