@@ -5,7 +5,7 @@ import math
 import os
 import shutil
 from collections import Counter
-from functools import cache
+from functools import cache, wraps
 from importlib.util import find_spec
 
 import numpy as np
@@ -39,6 +39,7 @@ def once(make):
     """What is made of a scene, which many simulations of a file have, is made once, unless it is read from a file."""
     known = {}
 
+    @wraps(make)
     def kept(scene, *others):
         key = scene.computed_json(), type(scene.container).shortened
         if "file=" in repr(scene):
