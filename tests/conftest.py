@@ -41,9 +41,9 @@ def once(make):
 
     @wraps(make)
     def kept(scene, *others):
-        key = scene.computed_json(), type(scene.container).shortened
         if "file=" in repr(scene):
             return make(scene, *others)
+        key = scene.computed_json(), type(scene.container).shortened
         return known[key] if key in known else known.setdefault(key, make(scene, *others))
 
     return kept

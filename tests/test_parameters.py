@@ -14,6 +14,7 @@ from cortado.device.precision import FLOAT64
 from cortado.gradients import Exact
 from cortado.particles.state import Fields, Layout
 from cortado.particles.wall_terms import SolidShares
+from cortado.rollout.parameter_space import ParameterSpace
 from cortado.scene.parameter_values import scene_values
 from cortado.scene.parameters import BY_NAME, PARAMETERS, Role, names
 from cortado.sph.gravity import Gravity
@@ -159,3 +160,19 @@ def test_gravity_adds_to_its_adjoint():
 def test_what_cannot_be_shared_is_said(shares):
     with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of some of rest_density, "):
         Shares([shares], Layout(3, 1, FLOAT64, "cpu"))
+
+
+def test_a_gravity_is_judged_with_the_other_values_of_its_run(monkeypatch):
+    """A weaker gravity needs no new look, but one that was looked at beside another viscosity does."""
+    looks, space = [], ParameterSpace(Simulation(plane()), 2)
+    monkeypatch.setattr(space, "_check", lambda values, number: looks.append(values))
+    strong, weak = [0.0, -20.0], [0.0, -5.0]
+    for gravity, viscosity, wanted in (
+        (strong, 0.1, 1),
+        (weak, 0.1, 1),
+        (weak, 0.2, 2),
+        (strong, 0.2, 3),
+        (weak, 0.2, 3),
+    ):
+        space.checked({"gravity": gravity, "viscosity": viscosity})
+        assert len(looks) == wanted

@@ -307,7 +307,7 @@ def launch_on_cpu(kernel: Any, threads: int, **arguments: Any) -> None:
 
 def recorded_on_cpu(kernel: Any, threads: int, **arguments: Any) -> Callable[[], None]:
     """Return a function that launches a kernel with these arguments, which may be NumPy arrays. Repeated launches are
-    cheaper than by `launch_on_cpu`, but use one core."""
+    cheaper than by `launch_on_cpu`. They use one core, so that threads may write to the same element."""
     from cortado.device.launching import recorded
     from cortado.device.threads import WARP
 

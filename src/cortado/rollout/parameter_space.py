@@ -68,7 +68,8 @@ class ParameterSpace:
         return found
 
     def _judge(self, values: Arrays) -> None:
-        """Check values for a run. Unchanged values are not checked again."""
+        """Check values for a run. Unchanged values, and a gravity weaker than the last checked one, are not checked
+        again."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()
         gravity = values.get("gravity")
@@ -82,8 +83,7 @@ class ParameterSpace:
         check_sizes({name: values[name] for name in changed}, self._simulation.precision, self._known)
         for number, own in enumerate(self._different(values)):
             self._check(own, number)
-        copies = {name: values[name].copy() if name in changed else last[name] for name in values}
-        self._judged = copies, strength
+        self._judged = {name: value.copy() for name, value in values.items()}, strength
 
     def checked_names(self, what: str, names: Iterable[str]) -> list[str]:
         found = require_names(what, names)
