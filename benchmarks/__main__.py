@@ -123,7 +123,7 @@ def watching(depth: int = 20, steps: int = 200, repeats: int = 3, device: str = 
 
 
 @command(app, answers=True)
-def loops(side: int = 15, steps: int = 20, repeats: int = 5, device: str = "cpu", json: Flag = False) -> Work:
+def loops(side: int = 15, steps: int = 20, repeats: int = 40, device: str = "cpu", json: Flag = False) -> Work:
     """Time loops of JAX in which a policy acts in every step, beside one call of as many steps.
 
     Args:
