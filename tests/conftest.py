@@ -138,12 +138,15 @@ def cortado_command(capfd, monkeypatch):
 
 @pytest.fixture(scope="module")
 def jax():
-    """In float64, as long as tests of a file run."""
+    """In float64, as long as tests of a file run, and compiled as quickly as can be: programs are small and run once."""
     import jax
 
-    jax.config.update("jax_enable_x64", True)
+    changed = ("jax_enable_x64", "jax_disable_most_optimizations")
+    for name in changed:
+        jax.config.update(name, True)
     yield jax
-    jax.config.update("jax_enable_x64", False)
+    for name in changed:
+        jax.config.update(name, False)
 
 
 @pytest.fixture

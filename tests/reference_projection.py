@@ -235,8 +235,8 @@ class Projection:
         reach, steps = np.arange(-5, 6) * self.spacing, np.linspace(0, np.pi / self.spacing, 25)
         lattice, waves = (np.stack(np.meshgrid(*[a] * d, indexing="ij"), -1).reshape(-1, d) for a in (reach, steps))
         g = replace(self, periods=np.zeros(d)).pairs(np.zeros((1, d)), lattice)[2][0]
-        square = (g**2).sum()
-        return 1 / (1.05 * ((np.sin(waves @ lattice.T) @ g) ** 2).sum(1).max() / square), square
+        square, near = (g**2).sum(), g.any(1)
+        return 1 / (1.05 * ((np.sin(waves @ lattice[near].T) @ g[near]) ** 2).sum(1).max() / square), square
 
     def around(self, x):
         """W, g, the sum of g, gamma, nu, M, H and the inverse of M."""

@@ -42,15 +42,10 @@ KEPT = {
         "test_every_stable_scene_has_its_numbers[projection wendland_c2 float32]",
     },
     "test_solids": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
-    "test_energy_budget": {"test_water_at_rest_has_the_pressure_of_its_depth"},
     "test_packages": {"test_they_are_there_in_processes_of_their_own"},
     "test_plants": {"test_plants_of_one_scene_are_found"},
     "test_projection": {"test_a_step_is_that_of_the_twin[space]"},
-    "test_reference_projection": {
-        "test_it_is_the_projection_of_the_warp_engine[plane]",
-        "test_steps_are_those_of_the_twin[scene-wendland_c2]",
-    },
-    "test_solid_loads": {"test_loads_have_derivatives[projection]"},
+    "test_reference_projection": {"test_it_is_the_projection_of_the_warp_engine[plane]"},
     "test_validation_flows": {
         "test_a_carreau_fluid_flows_between_plates_as_it_should",
         "test_a_dam_break_makes_no_energy_and_is_not_compressed[0.0025-1.00005]",
