@@ -138,7 +138,7 @@ def cortado_command(capfd, monkeypatch):
 
 @pytest.fixture(scope="module")
 def jax():
-    """In float64, as long as tests of a file run, and compiled as quickly as can be: programs are small and run once."""
+    """In float64, as long as tests of a file run, and compiled quickly: programs are small and run once."""
     import jax
 
     changed = ("jax_enable_x64", "jax_disable_most_optimizations")

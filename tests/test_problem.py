@@ -23,7 +23,7 @@ def simulation():
 
 @pytest.fixture
 def problem(simulation):
-    return Problem(simulation, 60, losses.FinalPositions(simulation.positions))
+    return Problem(simulation, 20, losses.FinalPositions(simulation.positions))
 
 
 def test_problems_and_runs_share_a_simulation(simulation, problem):
@@ -39,7 +39,7 @@ def test_problems_and_runs_share_a_simulation(simulation, problem):
         assert gradient.tobytes() == found[1][name].tobytes()
 
 
-@pytest.mark.parametrize(("estimator", "steps"), [(gradients.Exact(), 30), (gradients.Tape(), 8)])
+@pytest.mark.parametrize(("estimator", "steps"), [(gradients.Exact(), 6), (gradients.Tape(), 4)])
 def test_an_interruption_leaves_nothing_behind(simulation, estimator, steps, monkeypatch):
     loss, point = losses.FinalPositions(np.zeros((125, 3))), {**GRAVITY, "initial_positions": simulation.positions}
     problem, fresh = (Problem(simulation, steps, loss) for _ in range(2))
