@@ -1,12 +1,15 @@
 """Which tier a test belongs to: validation, slow, or the unit tier, which is neither; and how tests run commands."""
 
 import gc
+import json
 import math
 import os
+import re
 import shutil
 from collections import Counter
 from functools import cache, wraps
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,22 +38,38 @@ packing._packed = cache(packing._packed.__wrapped__)
 """All results are kept, not the last few: the same scenes come back in other tests."""
 
 
-def once(make):
-    """What is made of a scene, which many simulations of a file have, is made once, unless it is read from a file."""
+ELSEWHERE = {"emitter", "fluid", "forces", "hinge", "phase", "schedule", "solver", "spring"}
+"""Tables of a scene that its walls do not depend on."""
+
+
+def key_of(scene, aside=()):
+    told = {name: part for name, part in json.loads(scene.computed_json()).items() if name not in aside}
+    return json.dumps(told), type(scene.container).shortened
+
+
+def once(make, key):
+    """What is made of a scene, which many simulations of a file have, is made once for the contents of its files."""
     known = {}
 
     @wraps(make)
-    def kept(scene, *others):
-        if "file=" in repr(scene):
-            return make(scene, *others)
-        key = scene.computed_json(), type(scene.container).shortened
-        return known[key] if key in known else known.setdefault(key, make(scene, *others))
+    def kept(*given):
+        files = [Path(name) for name in re.findall(r"(?:file|path)='(.*?)'", repr(given[0]))]
+        if not all(file.is_file() for file in files):
+            return make(*given)
+        found = key(*given), *(file.read_bytes() for file in files)
+        return known[found] if found in known else known.setdefault(found, make(*given))
 
     return kept
 
 
-for name in ("walls_of", "fluid_particles", "_settled"):
-    setattr(discrete_scene, name, once(getattr(discrete_scene, name)))
+KEYS = {
+    "walls_of": lambda scene, lattice: key_of(scene, ELSEWHERE),
+    "_alone": lambda table, *others: (table.model_dump_json(), *map(repr, others)),
+    "fluid_particles": key_of,
+    "_settled": lambda scene, *others: key_of(scene),
+}
+for name, key in KEYS.items():
+    setattr(discrete_scene, name, once(getattr(discrete_scene, name), key))
 
 os.environ.setdefault(CORES, str(max(usable_cores() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")), 1)))
 """Each worker of pytest has its share of the cores: threads beyond it wait for each other. What several cores do is

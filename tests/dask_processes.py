@@ -10,6 +10,7 @@ from pathlib import Path
 
 PATIENCE = 60.0
 """Seconds after which something hangs."""
+ONE_THREAD = ("--nthreads", "1", "--no-nanny", "--preload", "work_for_workers")
 LOOPBACK = ("--host", "127.0.0.1", "--no-dashboard")
 
 
@@ -29,8 +30,8 @@ class Scheduler:
         return self._processes[0]
 
     def start_worker(self):
-        """One worker more."""
-        return self._start("dask_worker", self.address, "--nthreads", "1", "--no-nanny", *LOOPBACK)
+        """One worker more, whose kernels are those of the tests."""
+        return self._start("dask_worker", self.address, *ONE_THREAD, *LOOPBACK)
 
     def stop(self):
         for process in self._processes:

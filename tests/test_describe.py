@@ -141,7 +141,7 @@ def test_phases_and_an_emitter_are_told(capsys):
 def test_an_emitter_that_runs_dry_and_an_opening_that_is_no_whole_number_of_cells_are_told(capsys):
     """The flow rate is kept, and the speed is not that of the opening."""
     template = str(Path(cortado.__file__).parent / "cli/templates/jet.toml")
-    asked = [template, "--time", "2", "--set", "emitter[0].flow_rate=0.12"]
+    asked = [template, "--precision", "float64", "--time", "2", "--set", "emitter[0].flow_rate=0.12"]
     found = told(capsys, *asked)
     assert "of nozzle at 1.2 m/s" in found and "an opening of" not in found and "has fluid for 2.7" in found
     found = told(capsys, *asked, "--set", "emitter[0].radius=0.0575", "--set", "emitter[0].volume=0.18")

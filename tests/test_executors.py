@@ -186,7 +186,8 @@ def test_a_loss_of_the_main_module_travels(problem, workers):
     namespace = {"__name__": "__main__"}
     exec(MAIN, namespace)
     own = Problem(problem.simulation, 2, namespace["Loss"]())
-    assert workers.map(own.value, POINTS[:3]) == [own.value(point) for point in POINTS[:3]]
+    wanted = [own.value(point) for point in POINTS[:3]]
+    assert workers.map(own.value, POINTS[:3]) == wanted
 
 
 def test_the_error_of_the_first_item_that_has_one_is_raised(workers):

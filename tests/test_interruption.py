@@ -100,7 +100,6 @@ def test_signals_may_be_ignored_and_stderr_silenced():
 
 MISTAKE = ("run", "absent.toml")
 UNWRITTEN = "The result cannot be written to the standard output: "
-SENTENCE = "absent.toml: the scene cannot be read: No such file or directory.\n"
 
 
 @pytest.mark.parametrize(
@@ -126,28 +125,27 @@ def in_shell(line: str, *arguments: str, **environment: str) -> tuple[int, str]:
     return done.returncode, (done.stdout + done.stderr).decode()
 
 
-@pytest.mark.parametrize(
-    ("line", "arguments", "code", "said"),
-    [
-        ('"$@"', MISTAKE, 2, SENTENCE),
-        ('"$@" 2>&-', MISTAKE, 2, ""),
-        ('"$@" <&- >&- 2>&-', MISTAKE, 2, ""),
-        ('"$@" 2>/dev/full', MISTAKE, 2, ""),
-        ('"$@" 2> >(exec 0<&-; sleep 1)', MISTAKE, 2, ""),
-        ('"$@" | true; exit ${PIPESTATUS[0]}', ["run", "--help"], 141, ""),
-        ('"$@" >/dev/full', ["--help"], 1, f"{UNWRITTEN}No space left on device.\n"),
-        ('"$@" >&-', ["schema"], 1, f"{UNWRITTEN}Bad file descriptor.\n"),
-    ],
-)
+STREAMS = {
+    "err closed": ('"$@" 2>&-', MISTAKE, 2, ""),
+    "all closed": ('"$@" <&- >&- 2>&-', MISTAKE, 2, ""),
+    "err full": ('"$@" 2>/dev/full', MISTAKE, 2, ""),
+    "err unread": ('"$@" 2> >(exec 0<&-; sleep 1)', MISTAKE, 2, ""),
+    "out unread": ('"$@" | true; exit ${PIPESTATUS[0]}', ["run", "--help"], 141, ""),
+    "out full": ('"$@" >/dev/full', ["--help"], 1, f"{UNWRITTEN}No space left on device.\n"),
+    "out closed": ('"$@" >&-', ["schema"], 1, f"{UNWRITTEN}Bad file descriptor.\n"),
+}
+
+
+@pytest.mark.parametrize("line, arguments, code, said", STREAMS.values(), ids=STREAMS)
 def test_broken_streams_leave_the_exit_code(line, arguments, code, said):
     assert in_shell(line, *arguments) == (code, said)
 
 
-def test_names_that_cannot_be_shown_are_escaped():
+@pytest.mark.parametrize("encoding, accent", [("ascii", "\\xe9"), ("utf-8", "é")], ids=["ascii", "utf-8"])
+def test_names_that_cannot_be_shown_are_escaped(encoding, accent):
     name = os.fsdecode("é".encode() + b"\xff\x1b[31m")
-    for encoding, accent in (("ascii", "\\xe9"), ("utf-8", "é")):
-        found = in_shell('"$@"', "run", name, PYTHONIOENCODING=encoding)
-        assert found == (2, f"{accent}\\xff\\x1b[31m: the scene cannot be read: No such file or directory.\n")
+    found = in_shell('"$@"', "run", name, PYTHONIOENCODING=encoding)
+    assert found == (2, f"{accent}\\xff\\x1b[31m: the scene cannot be read: No such file or directory.\n")
 
 
 MAPPING = "libx.so: failed to map segment from shared object"

@@ -254,7 +254,7 @@ def test_what_is_slow_is_left_out_of_what_is_short():
         def __init__(self, file, name):
             self.path, self.name, self.originalname = TESTS / f"{file}.py", name, name.partition("[")[0]
 
-    kept, quick = Item("test_examples", "test_the_code_runs_as_printed"), Item("test_terms", "test_of_a_second")
+    kept, quick = Item("test_cli", "test_run_writes_its_folder"), Item("test_terms", "test_of_a_second")
     case = Item("test_docs", "test_the_code_runs_as_printed[solids.md]")
     assert short([kept, Item("test_plants", "test_every_plant_is_found[x]"), quick, case]) == [kept, quick]
 

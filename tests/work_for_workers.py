@@ -1,9 +1,13 @@
-"""What worker processes are given to do, in a module that they can import. Their kernels have the flags of users."""
+"""What worker processes are given to do, in a module that they can import. Their kernels are those of the tests."""
 
 import os
 import time
 
 import numpy as np
+
+from compiling_notice import FLAGS, compile_fast
+
+compile_fast(FLAGS)
 
 
 class FarFromHome:
