@@ -41,7 +41,7 @@ def deepest(run: Any, solid: SolidTable) -> float:
     return float(max(-own.distance(in_frame(run, solid.name, frame)).min() for frame in frames))
 
 
-def stirred(across: int, steps: int, thickness: float = 0.08) -> dict[str, float]:
+def stirred(across: int, steps: int, thickness: float = 0.08, precision: str = "float32") -> dict[str, float]:
     """A square of water, so many particles wide, with a paddle in it, of a thickness [m], that turns about its middle
     and whose tips move at 1 m/s: the greatest depth of a particle in the paddle, and outside of the tank, in
     spacings."""
@@ -50,7 +50,7 @@ def stirred(across: int, steps: int, thickness: float = 0.08) -> dict[str, float
     paddle = box(list(middle - half), list(middle + half), name="paddle", motion="path")
     paddle["angular_velocity"] = float(1.0 / np.linalg.norm(half))
     run = simulated(
-        *(2, spacing, 0.045 * spacing, steps, 20),
+        *(2, spacing, 0.045 * spacing, steps, 20, precision),
         fluid=[box([0.0, 0.0], [1.0, 1.0], phase="water")],
         container=box([0.0, 0.0], [1.0, 1.5]),
         solid=[paddle],

@@ -42,14 +42,12 @@ KEPT = {
         "test_every_stable_scene_has_its_numbers[pcisph emitter float64]",
         "test_every_stable_scene_has_its_numbers[projection wendland_c2 float32]",
     },
-    "test_solids": {"test_a_mesh_holds_water[torus]", "test_a_paddle_stirs_and_nothing_enters_it"},
+    "test_solids": {"test_a_paddle_stirs_and_nothing_enters_it"},
     "test_plants": {"test_plants_of_one_scene_are_found"},
     "test_projection": {"test_a_step_is_that_of_the_twin[space]"},
     "test_reference_projection": {"test_it_is_the_projection_of_the_warp_engine[plane]"},
     "test_validation_flows": {
-        "test_a_carreau_fluid_flows_between_plates_as_it_should",
         "test_a_dam_break_makes_no_energy_and_is_not_compressed[0.0025-1.00005]",
-        "test_a_jet_that_falls_is_drawn_out_and_keeps_together[0.0]",
         "test_vortices_decay_as_they_must[32-100.0-1.0-0.035]",
     },
 }

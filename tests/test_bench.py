@@ -27,11 +27,13 @@ STEP = [
 
 @pytest.fixture(scope="module")
 def found():
-    return json.loads(bench_dam_break([8, 27], 2, 1, "cpu", "float32", "pcisph", as_json=True))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.bench.floor.COPIED", 2**20)
+        return json.loads(bench_dam_break([27], 2, 1, "cpu", "float64", "pcisph", as_json=True))
 
 
 def test_every_size_and_every_pass_of_a_step_has_a_time_and_a_floor(found):
-    assert [row["particles"] for row in found["sizes"]] == [8, 27]
+    assert [row["particles"] for row in found["sizes"]] == [27]
     assert found["environment"].keys() >= {"device", "cores", "warp", "date", "cores_busy_elsewhere"}
     assert found["copy_bandwidth_gb_per_s"] > 0.0 and found["empty_launch_us"] > 0.0
     for row in found["sizes"]:
@@ -45,16 +47,16 @@ def test_every_size_and_every_pass_of_a_step_has_a_time_and_a_floor(found):
 
 
 def test_passes_occur_as_often_as_a_step_launches_them(found):
-    launches = {one["name"]: one["launches"] for one in found["sizes"][1]["passes"]}
+    launches = {one["name"]: one["launches"] for one in found["sizes"][0]["passes"]}
     assert launches["pressure"] == launches["pressure force"] == ITERATIONS
     assert launches["density"] == launches["viscosity"] == launches["neighbour list"] == 1
-    back = {one["name"]: one["launches"] for one in found["sizes"][1]["adjoint_passes"]}
+    back = {one["name"]: one["launches"] for one in found["sizes"][0]["adjoint_passes"]}
     assert back["pressure adjoint"] == back["pressure force adjoint"] == ITERATIONS and back["viscosity adjoint"] == 1
     assert AGAIN in back
 
 
 def test_floors_are_those_of_the_passes_and_only_sums_over_neighbours_have_pairs(found):
-    row = found["sizes"][1]
+    row = found["sizes"][0]
     step = sum(one["floor_ms"] for one in row["passes"])
     back = sum(one["floor_ms"] for one in row["adjoint_passes"])
     assert row["step"]["floor_ms"] == pytest.approx(step) == row["rollout"]["floor_ms"]

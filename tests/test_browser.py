@@ -19,6 +19,8 @@ from cortado.cli.views import opened
 PORT = 18410
 PATIENCE = 20.0
 """[s] that a page has to show what it should."""
+SIZE = {"width": 800, "height": 560}
+"""Of the window in pixels: Chromium draws them without a GPU."""
 PANEL = 330
 """Pixels on the right that the viewer's panel covers, at most."""
 
@@ -38,7 +40,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser) -> Iterator[Any]:
-    found = browser.new_page(viewport={"width": 1000, "height": 800})
+    found = browser.new_page(viewport=SIZE)
     complaints = listened(found)
     yield found
     found.close()
@@ -69,8 +71,16 @@ def report(folder: Path, text: str, steps: int) -> str:
     return (folder / "a/report.html").resolve().as_uri()
 
 
-def test_a_report_plays(page, tmp_path):
-    page.goto(report(tmp_path, TINY_SCENE, 120))
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """The folder of a run, which is in ``a``."""
+    folder = tmp_path_factory.mktemp("run")
+    report(folder, TINY_SCENE, 120)
+    return folder
+
+
+def test_a_report_plays(page, run):
+    page.goto((run / "a/report.html").as_uri())
     view = page.locator(".particle-view")
     canvas, clock = view.locator("canvas"), view.locator("output")
     first = pixels(canvas)
@@ -155,9 +165,9 @@ def test_a_scene_runs_in_the_viewer(page, look):
         until(page, shown, page.get_by_text(f"{colour} [{unit}]").is_visible)
 
 
-def test_a_run_is_scrubbed_in_the_viewer(page, look):
-    report(Path(), TINY_BLOCK, 120)
-    shown = look(TINY_BLOCK)
+def test_a_run_is_scrubbed_in_the_viewer(page, look, run, monkeypatch):
+    monkeypatch.chdir(run)
+    shown = look(TINY_SCENE)
     until(page, shown, lambda: shown.slider.value > 2)
     page.get_by_text("Play", exact=True).click()
     until(page, shown, lambda: not shown.playing.value)
@@ -174,7 +184,7 @@ def test_a_viewer_is_loaded_again_and_looked_at_twice(browser, page, look):
     shown = look(TINY_SCENE)
     page.reload()
     until(page, shown, lambda: coloured(scene_of(page)) > 0.01)
-    other = browser.new_page(viewport={"width": 1000, "height": 800})
+    other = browser.new_page(viewport=SIZE)
     other.goto(shown.window.address)
     until(page, shown, lambda: coloured(scene_of(other)) > 0.01)
     other.get_by_text("Run", exact=True).click()

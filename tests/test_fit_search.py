@@ -242,7 +242,8 @@ def test_on_a_full_disk_a_fit_says_so(task, tmp_path, cortado_command, monkeypat
         return replace(old, new, **options)
 
     monkeypatch.setattr(os, "replace", refuse)
-    quick = [word for key in ("profiles=0", "starts=1", "iterations=1") for word in ("--set", f"fit.{key}")]
+    keys = ("fit.profiles=0", "fit.starts=1", "fit.iterations=1", "container.slip=free")
+    quick = [word for key in keys for word in ("--set", key)]
     code, _, err = cortado_command("fit", task, "--out", tmp_path / "run", *quick)
     assert code == 1, err
     assert_one_sentence(err.removesuffix("\n").splitlines()[-1])

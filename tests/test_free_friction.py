@@ -41,7 +41,8 @@ def friction_of(simulation):
 def test_the_solve_is_that_of_a_twin():
     """Dense, of all particles and the body, after steps whose pressures count: forces on the body are those on wall
     particles, at the surface below each particle."""
-    scene = plane({**ROUGH, "density": 60.0}, phase=SYRUP)
+    few = box([0.1, 0.1], [0.55, 0.4], phase="water")
+    scene = plane({**ROUGH, "density": 60.0}, phase=SYRUP, fluid=[few])
     simulation = Simulation(scene, precision="float64")
     state = simulation.run(3).last_state
     simulation.run(1, state=state)
@@ -109,7 +110,8 @@ def test_bodies_of_any_density_rest_in_syrup(density):
     """Light ones rise and heavy ones sink, both slowly and without a swing."""
     ball = {**BALL, "centre": [0.3, 0.2], "density": density, "slip": "no"}
     scene = plane(ball, phase=SYRUP, container=box([0.0, 0.0], [0.6, 1.0], slip="no"))
-    velocities = Simulation(scene).run(120, record_every=1).solids["ball"].velocities[:, 1]
+    run = Simulation(scene, precision="float64").run(120, record_every=1)
+    velocities = run.solids["ball"].velocities[:, 1]
     assert np.abs(velocities).max() < 0.6 and np.abs(np.diff(velocities[60:], n=2)).max() < 0.01
 
 

@@ -73,9 +73,10 @@ def test_walls_are_where_the_path_says_and_move_as_it_does(scene, scale):
 def test_a_run_goes_on_where_fluid_is_where_a_solid_was_at_the_start():
     block = box([0.5, 0.0], [0.7, 0.3], name="block", motion="path", velocity=[0.0, 2.0])
     scene = plane(block, solver={"kind": "pcisph", "time_step": 0.001})
-    whole = Simulation(scene).run(300)
+    simulation = Simulation(scene, precision="float64")
+    whole = simulation.run(300)
     assert ((np.abs(whole.positions[250] - [0.6, 0.1]) < [0.07, 0.07]).all(axis=1)).any()
-    rest = Simulation(scene).run(50, state=whole[:251].last_state)
+    rest = simulation.run(50, state=whole[:251].last_state)
     assert rest.positions[-1].tobytes() == whole.positions[-1].tobytes()
 
 
@@ -143,10 +144,10 @@ RESTING |= {"positions": [[0.3, 0.65], [0.3, 0.65], [0.5, 0.65]]}
 @pytest.mark.parametrize("kind", ["projection", "pcisph"])
 def test_the_fast_part_of_a_path_bounds_the_steps_that_it_is_in(kind, tmp_path):
     tables = {"solver": {"kind": kind, "time_step": "auto"}}
-    simulation = Simulation(plane(RESTING, **tables))
+    simulation = Simulation(plane(RESTING, **tables), precision="float64")
     run = simulation.run(time=0.4)
     still = {**RESTING, "positions": [[0.3, 0.65]] * 3}
-    resting = Simulation(plane(still, **tables)).run(time=0.3)
+    resting = Simulation(plane(still, **tables), precision="float64").run(time=0.3)
     before = np.count_nonzero(run.times < 0.3)
     np.testing.assert_array_equal(run.times[:before], resting.times[:before])
     ways = np.diff(np.interp(run.times, RESTING["times"], [0.3, 0.3, 0.5]))
@@ -161,12 +162,13 @@ def test_the_fast_part_of_a_path_bounds_the_steps_that_it_is_in(kind, tmp_path):
 
 def test_what_turns_and_a_nozzle_bound_the_steps_that_are_chosen():
     turn = {key: RESTING[key] for key in RESTING if key != "positions"} | {"rotations": [0.0, 0.0, 1.0]}
-    run = Simulation(plane(turn, solver={"kind": "projection", "time_step": "auto"})).run(time=0.4)
+    simulation = Simulation(plane(turn, solver={"kind": "projection", "time_step": "auto"}), precision="float64")
+    run = simulation.run(time=0.4)
     angles = np.interp(run.times, RESTING["times"], [0.0, 0.0, 1.0])
     assert np.diff(angles).max() * np.hypot(0.1, 0.1) == pytest.approx(0.2 * 0.05, rel=1e-4)
     course = {"times": [0.05, 0.051], "values": [[0.3, 0.26], [0.4, 0.26]]}
     shooting = jet(solver={"kind": "pcisph", "time_step": "auto"}, path=course)
-    run = Simulation(shooting).run(time=0.06)
+    run = Simulation(shooting, precision="float64").run(time=0.06)
     ways = np.diff(np.interp(run.times, course["times"], [0.3, 0.4]))
     assert ways.max() == pytest.approx(0.2 * jet().discretisation.spacing, rel=1e-4)
     assert np.count_nonzero(run.times < 0.05) < 30
@@ -174,7 +176,7 @@ def test_what_turns_and_a_nozzle_bound_the_steps_that_are_chosen():
 
 def test_scenes_of_a_batch_have_the_steps_of_their_own_paths():
     scene = plane(RESTING, solver={"kind": "projection", "time_step": "auto"})
-    one, several = Simulation(scene), Simulation(scene, batch=2)
+    one, several = (Simulation(scene, precision="float64", batch=size) for size in (None, 2))
     scales = np.array([1.0, 1.4])
     for scale, run in zip(scales, several.run(80, {"block.scale": scales}), strict=True):
         wanted = one.run(80, {"block.scale": scale})
@@ -187,7 +189,8 @@ def test_scenes_of_a_batch_have_the_steps_of_their_own_paths():
 @pytest.mark.parametrize("length", [1e-6, 1e-15])
 def test_a_path_that_jumps_is_one_step_and_said(length):
     times = [0.0, 0.1, 0.1 + length]
-    simulation = Simulation(plane({**RESTING, "times": times}, solver={"kind": "projection", "time_step": "auto"}))
+    scene = plane({**RESTING, "times": times}, solver={"kind": "projection", "time_step": "auto"})
+    simulation = Simulation(scene, precision="float64")
     with pytest.warns(cortado.CortadoWarning, match=r"'block' goes 0\.2 m in .* at 0\.1 s, which is further than"):
         run = simulation.run(time=0.2)
     assert len(run.times) < 300 and run.times[-1] >= 0.2

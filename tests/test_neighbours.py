@@ -297,7 +297,7 @@ def test_lists_that_are_too_short_say_how_long_they_must_be(capacity, precision)
         np.testing.assert_array_equal(row[:length], whole[:length])
 
 
-@settings(max_examples=40, deadline=None, database=None, derandomize=True)
+@settings(max_examples=20, deadline=None, database=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**31),
     n=st.integers(1, 120),

@@ -48,7 +48,7 @@ def test_the_gradient_of_a_quantity_is_that_of_forward_mode_and_of_differences(m
     assert distance(problem.value, point, along, derivative, SIZES, enough=1e-6) < 1e-6
 
 
-@pytest.mark.parametrize("make", [SCENES["plane"], SCENES["projection"]])
+@pytest.mark.parametrize("make", [plane, lambda: plane(solver=PROJECTION, solid=[ROTOR])])
 def test_a_loss_of_several_quantities_has_the_sum_of_their_gradients(make):
     """Of a pressure and a speed: the adjoint of velocities at the start of a step is none of the forces in it."""
     problem, point, along = problem_of(make, "pressure", steps=3)

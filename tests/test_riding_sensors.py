@@ -24,9 +24,10 @@ RATE = 1.0
 
 
 # ---- what they make of fields ------------------------------------------------------------------------------------
+@cache
 def fields(dimension):
     """A class of states of a basin with two solids that move, and one of them, with numbers for all that is read."""
-    basin = Basin(dimension, turned(dimension), spacing=0.05 if dimension == 2 else 0.1)
+    basin = Basin(dimension, turned(dimension), spacing=0.05 if dimension == 2 else 0.125)
     random, angles = np.random.default_rng(4), 2 * dimension - 3
 
     class Fields(dict):
@@ -333,7 +334,7 @@ def test_solids_at_rest_carry_nothing_and_views_that_turn_have_no_images():
             plane(solid=[sill], sensor=[{"name": "mine", **table}])
     for sensor in (PressureProbe([0.1, 0.1], on="sill"), SolidLoad("sill", axes="body")):
         with pytest.raises(InputError, match="is on 'sill', but must be on a solid that moves; the scene has none"):
-            cortado.Simulation(plane(solid=[sill])).run(1, sensors={"mine": sensor})
+            cortado.Simulation(plane(solid=[sill]), precision="float64").run(1, sensors={"mine": sensor})
     for make, words in (
         (lambda: PressureProbe([0.1, 0.1], on=3), "on is 3, but must be the name"),
         (lambda: WallForce(axes="body"), "as the sensor is on no solid"),
@@ -343,7 +344,7 @@ def test_solids_at_rest_carry_nothing_and_views_that_turn_have_no_images():
             make()
     drifting = {**sill, "motion": "path", "velocity": [0.1, 0.0]}
     room = box([0.0, 0.0], [0.6, 0.6], periodic=[True, False])
-    simulation = cortado.Simulation(plane(solid=[drifting], container=room))
+    simulation = cortado.Simulation(plane(solid=[drifting], container=room), precision="float64")
     for sensor in (WaveGauge([0.1, 0.0], on="sill", axes="body"), WallForce(on="sill")):
         with pytest.raises(InputError, match="has no images along periodic axes"):
             simulation.run(1, sensors={"mine": sensor})

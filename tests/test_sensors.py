@@ -385,7 +385,8 @@ NOWHERE = {
 
 @pytest.mark.parametrize(("sensor", "words"), NOWHERE.values(), ids=NOWHERE)
 def test_a_sensor_that_can_never_see_fluid_is_warned_of_before_the_run(sensor, words):
-    simulation = cortado.Simulation(plane(solid=[{**BLOCK, "motion": "path", "velocity": [0.0, 0.0]}]))
+    scene = plane(solid=[{**BLOCK, "motion": "path", "velocity": [0.0, 0.0]}])
+    simulation = cortado.Simulation(scene, precision="float64")
     dt, series = simulation.scene.solver.time_step, [[0.0] * len(sensor.columns(2))] * 2
     with pytest.warns(CortadoWarning, match=f"the sensor 'mine' .*{words}"):
         Watch(simulation, simulation.rollout(1), sensors={"mine": sensor})

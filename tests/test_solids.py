@@ -298,7 +298,7 @@ def test_a_lining_thinner_than_a_spacing_has_the_wall_particles_of_what_is_behin
 
 
 def test_a_paddle_stirs_and_nothing_enters_it():
-    found = stirred(14, 330, thickness=0.14)
+    found = stirred(14, 330, thickness=0.14, precision="float64")
     assert found["turns"] > 0.6
     assert found["deepest"] < 0.5 and found["outside"] < 0.5
 
