@@ -33,7 +33,7 @@ def at():
     """What functions are called with, when all is well."""
     made = SimpleNamespace(scene=cortado.Scene(**plane(picture=SMALL)), loss=losses.CentreOfMass([0.0, 0.0]))
     made.start = {"gravity": [0.0, -9.0]}
-    made.simulation = cortado.Simulation(made.scene)
+    made.simulation = cortado.Simulation(made.scene, precision="float64")
     made.problem = cortado.Problem(made.simulation, 2, made.loss)
     made.trajectory, made.renderer = made.simulation.run(2), made.simulation.renderer(resolution=(10, 8))
     made.image = made.renderer.render(made.trajectory[0])
@@ -117,7 +117,8 @@ def test_guided_is_named_where_it_is_given_a_batch():
 MODULES = [name for name in cortado.__all__ if isinstance(getattr(cortado, name), ModuleType)]
 PUBLIC = ["cortado", *(f"cortado.{name}" for name in [*MODULES, "environments", "jax"])]
 ODD = ("nothing", "a fraction", "a letter", "an object")
-FEW = {"Ensemble.around", "Ensemble.evaluated", "EnsembleMean.combined", "Trajectory.picture"}
+FEW = {"Ensemble.around", "Ensemble.evaluated", "EnsembleMean.combined", "Trajectory.picture", "Trajectory.to_xarray"}
+FEW |= {"certify"}
 """What gets the odd values alone, as parts of Cortado call it with what was looked at, or as it takes seconds."""
 
 

@@ -447,7 +447,7 @@ def wedge(gap, **tables):
 
 
 def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(unpacked):
-    simulation = Simulation(wedge(0.012))
+    simulation = Simulation(wedge(0.012), precision="float64")
     whole = simulation.run(65)
     sizes = sizes_of(whole)
     again = np.flatnonzero(sizes[1:] < 0.3 * sizes[:-1]) + 1
@@ -455,7 +455,7 @@ def test_a_step_that_presses_particles_between_walls_is_taken_again_shorter(unpa
     before = int(again[0])
     rest = simulation.run(65 - before, state=whole[: before + 1].last_state)  # of which the first step is taken again
     assert rest.positions.tobytes() == whole.positions[before:].tobytes()
-    pair = Simulation(wedge(0.012), batch=2).run(65, {"viscosity": np.array([0.001, 0.1])})
+    pair = Simulation(wedge(0.012), precision="float64", batch=2).run(65, {"viscosity": np.array([0.001, 0.1])})
     assert pair[0].positions.tobytes() == whole.positions.tobytes()
     assert whole.diagnostics["greatest_density_errors"].max() < 0.3
 
@@ -506,11 +506,11 @@ def lowered(gap, kind="projection", **changes):
 
 @pytest.mark.parametrize("gap", [0.0, 0.3, 0.5])
 def test_between_walls_that_close_to_less_than_a_spacing_the_projection_loses_nothing(gap):
-    assert Simulation(lowered(gap)).run(time=0.3).times[-1] >= 0.3
+    assert Simulation(lowered(gap), precision="float64").run(time=0.3).times[-1] >= 0.3
 
 
 def test_walls_that_close_to_less_than_a_spacing_are_the_cause_that_is_named():
-    simulation = Simulation(lowered(0.5, "pcisph"))
+    simulation = Simulation(lowered(0.5, "pcisph"), precision="float64")
     with pytest.raises(cortado.DivergedError) as found:
         simulation.run(time=0.3)
     assert "fluid is shut in by the container and the solid 'plate'" in str(found.value)
