@@ -90,7 +90,7 @@ def _metrics(one: RunFolder, other: RunFolder, settings: list[dict[str, Any]], s
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Compare the fields of two runs in their last frames with equal times."""
+    """Compare the fields of two runs at the latest time of which both have a frame."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]

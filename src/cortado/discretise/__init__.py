@@ -1,1 +1,1 @@
-"""The rest lattice, smoothing kernels, shapes, packing and walls, in NumPy and float64."""
+"""Shapes, their particles and walls at the start, and smoothing kernels, in NumPy and float64."""

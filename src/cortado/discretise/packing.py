@@ -136,7 +136,7 @@ DAMPING, MOST_INNER_ROUNDS = 0.02, 20
 
 
 def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
-    """Return the relative density excess (n,), which is at least 0 where ``stays`` (n,) is true."""
+    """Return the relative density excess (n,). Negative values are set to 0 where ``stays`` (n,) is true."""
     errors = around.volume * sums - (1.0 - SLACK)
     return np.where(stays, np.maximum(errors, 0.0), errors)
 

@@ -308,7 +308,7 @@ def wall_weights(
 
 
 def even_changes(sums: "csr_array", wanted: Points) -> Points:
-    """Solve ``sums @ changes = wanted`` for relative changes of flat-wall weights. New weights are at least 0."""
+    """Solve ``sums @ changes = wanted`` for relative changes, at least -1, of the weights of flat walls' particles."""
     from scipy.optimize import lsq_linear
     from scipy.sparse import eye_array, vstack
 

@@ -86,7 +86,7 @@ class Snapshot(OnHost):
 
     @property
     def solids(self) -> tuple[SolidTable, ...]:
-        """Tables of the scene's solids in their initial positions. The positions of moving solids are in the state."""
+        """The scene's tables ``[[solid]]``, with initial positions. The positions of moving solids are in the state."""
         return moment_of(self).evaluator().solids
 
     @property

@@ -171,7 +171,7 @@ def evaluate(
             parameter is out of range. By default the loss is NaN, and a `CortadoWarning` is given.
         on_result: function that is called with the number and the `Estimate` of each computed point, in any order.
 
-    The gradient of a failed point is NaN, and its `Estimate.diverged` is the error. Any other error of a point is
+    The gradient of a failed point is NaN, and `Estimate.diverged` holds the exception. Any other exception is
     raised. If all points fail, the error of the first point is raised, unless ``loss_if_diverged`` is given.
 
     Example::
@@ -228,7 +228,7 @@ def optimise(
         bounds: lower and upper bound of each parameter by name. A bound is a number, an array in the shape of the
             parameter, or None.
         gradient: gradient estimator for the problem.
-        checkpoint: folder of the replay log. Every evaluation is written to it before the next one begins.
+        checkpoint: folder of the replay log. Every evaluation is written to the log before the next one begins.
         resume: continue the run in ``checkpoint``, or begin a new run in an empty folder. A resumed run gives exactly
             the numbers of a run without interruption. The number of ``iterations`` may change.
         on_iteration: function that is called with the `Record` of every evaluation. The function is

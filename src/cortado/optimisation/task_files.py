@@ -89,7 +89,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
-    """Check values by parameter name, and interpolate values at knots to all time steps."""
+    """Check the values of each named parameter, and interpolate values that are given at knots to all time steps."""
     found = {}
     for name, array in values.items():
         field, parameter = f"{table}.{name}", known[name]

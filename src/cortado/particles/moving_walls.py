@@ -182,7 +182,7 @@ class MovingWalls:
         self.sizes.power = precision.real(dimension - 1)
         self.each = [{name: array[:, k] for name, array in self.named.items()} for k in range(solids)]
         self.slides = wp.zeros(solids, dtype=precision.vector, device=device)
-        """Velocities with which the surfaces slide along the solids (solids,) [m/s], in the frames of the solids."""
+        """Velocity [m/s] of each solid's surface relative to the solid, in the solid's frame: vectors (solids,)."""
         slides = np.zeros((solids, 3))
         slides[walls.solid] = walls.slides
         self.slides.assign(slides)

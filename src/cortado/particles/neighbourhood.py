@@ -175,7 +175,7 @@ def neighbourhood_type(precision: Precision) -> Any:
         """Matrix for each face, in the frame of its solid. The rows of the matrix are the normal towards the fluid and
         two unit vectors along the face."""
         face_sizes: wp.array(dtype=vector)
-        """Vector (0, a, b) for each face, with half the lengths a and b along the face's two unit vectors [m]."""
+        """Vector (0, a, b) for each face: a and b are half of the face's two side lengths [m]."""
         wall_faces: wp.array(dtype=wp.int32)
         after: wp.array2d(dtype=vector)
         """Positions of the middles of solids after the time step (members, solids) [m]."""

@@ -186,7 +186,8 @@ def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -
 
 
 def _colour_scale(sets: list[Points], colours: Sequence[NDArray | None]) -> tuple[list[NDArray], Any, str]:
-    """Return colours (n, 3) of each panel, the scale of numbers or None, and the end at which the scale clips."""
+    """Return the colours (n, 3) of each panel, the colour bar's scale if particles have numbers, and which end of the
+    scale has numbers beyond it."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 

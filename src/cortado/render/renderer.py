@@ -150,8 +150,8 @@ class Renderer:
         """Return the picture (rows, columns, 3) in float64, with row 0 at the top.
 
         Args:
-            positions: a frame, positions (n, d) [m], or a Warp array (n,) of vectors in the renderer's precision and on
-                its device. A frame, such as ``trajectory[-1]`` or ``problem.end(parameters)``, also contains mass
+            positions: positions (n, d) [m], a Warp array (n,) of vectors in the renderer's precision and on its device,
+                or a frame. A frame, such as ``trajectory[-1]`` or ``problem.end(parameters)``, also contains mass
                 fractions and perhaps colours.
             fractions: (n, phases) mass fractions [-], or a Warp array (n,) of vectors; not needed for a single phase.
             colours: (phases, 3) colours of the phases; by default the renderer's colours.

@@ -122,7 +122,7 @@ class ParameterSpace:
         states: Sequence[RestartState] = (),
         write: Callable[[State], None] | None = None,
     ) -> None:
-        """Set the first state and parameters of a rollout. ``varied`` names parameters for derivatives."""
+        """Set the first state and parameters of a rollout. ``varied`` names the parameters to differentiate."""
         simulation, members = self._simulation, [self._one.upright(own) for own in self._different(values)]
         if write is not None and self._goes_on(rollout, values, varied, states):
             self._go_on(rollout, members, states, write)

@@ -109,7 +109,7 @@ def packing_kernels(precision: Precision, taped: bool) -> SimpleNamespace:
 
 
 class Numbers:
-    """The values of several parameters, stored in one array (members, numbers)."""
+    """The numbers of several parameters in one array, with a row for each scene of a batch."""
 
     def __init__(self, parameters: Sequence[Parameter], layout: Layout, taped: bool):
         self._kernels = packing_kernels(layout.precision, taped) if parameters else None

@@ -7,8 +7,8 @@ rotation.
 A solid with a prescribed path starts at its initial pose, and is displaced and turned by the path. The velocity of a
 wall particle is its displacement in a step divided by the time step.
 
-Rotations are rotation vectors (Rodrigues), in 2-D angles. If the rotation vector w changes by a small vector u, the
-rotation is followed by the small rotation J u with the Jacobian
+A rotation is a rotation vector (Rodrigues) in 3-D, and an angle in 2-D. If the rotation vector w changes by a small
+vector u, the rotation is followed by the small rotation J u with the Jacobian
 
     J = I + (1 - cos |w|) / |w|^2 [w] + (|w| - sin |w|) / |w|^3 [w]^2,
 

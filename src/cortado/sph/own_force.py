@@ -56,7 +56,7 @@ class OverTime:
             wanted = f"({len(self.times)},) or ({len(self.times)}, d), with a row for each of the times"
             raise InputError(f"OverTime values have shape {self.values.shape}, but must be {wanted}.")
         if not np.isfinite(self.values).all():
-            raise InputError("OverTime values have one that is not finite, but must be numbers.")
+            raise InputError("A value of OverTime is not finite, but all must be finite numbers.")
         self._course = Knots(self.times, self.values)
 
     def __repr__(self) -> str:

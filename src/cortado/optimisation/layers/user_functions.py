@@ -76,7 +76,7 @@ class Bridge(ABC):
 def bound(
     function: Callable[Concatenate[Bridge, Arguments], Result], bridge: Bridge, module: str
 ) -> Callable[Arguments, Result]:
-    """Bind a function of this module to a ``bridge``, and return it as a public function of ``module``."""
+    """Return ``function`` with its first argument set to ``bridge``, as a public function of ``module``."""
 
     def call(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
         return function(bridge, *arguments, **named)

@@ -234,7 +234,7 @@ class JaxBridge(Bridge):
             raise InputError(f"{what} is {value.dtype}, but must be {real}, the simulation's precision.")
         if not jnp.issubdtype(value.dtype, jnp.floating) and not jnp.issubdtype(value.dtype, jnp.integer):
             found = Words(f"an array of {value.dtype}")
-            raise InputError(f"{what} is {found}, but must be one of real numbers.")
+            raise InputError(f"{what} is {found}, but must be an array of real numbers.")
         return value.astype(real)
 
     def made(self, found: Named, layer: Layer) -> dict[str, Any]:
