@@ -172,7 +172,7 @@ def test_the_error_is_that_at_the_measured_times(recorded, cortado_command, head
         ("time,gauge.height [mm]\n0,1\n", "has gauge.height in mm, but must have it in m"),
         ("gauge.height\n1\n", "but must have time [s], and some of gauge.height"),
         ("time\n1\n", "has only times"),
-        ("time,gauge.height\n2,1\n", "has no value of gauge.height within the run"),
+        ("time,gauge.height\n2,1\n", "has no value of gauge.height from 0 to 1 s"),
         ("", "must have a line of different names"),
     ],
 )

@@ -271,7 +271,7 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
         within = there & (times >= own.times[0]) & (times <= own.times[-1])
         if not within.any():
             ends = f"{own.times[0]:g} to {own.times[-1]:g} s"
-            raise InputError(f"{path} has no value of {name} between {ends}, the times of the run, but must have one.")
+            raise InputError(f"{path} has no value of {name} from {ends}, the times of the run, but must have one.")
         simulated = np.interp(times[within], own.times, own[column])
         left_out = int(np.count_nonzero(there & ~within))
         found.append(MeasuredColumn(name, own.units[column], times[within], values[within], simulated, left_out))
