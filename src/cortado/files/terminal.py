@@ -1,8 +1,8 @@
 """Messages on stdout and stderr, progress of long computations, and handling of signals.
 
-Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect. In a block ``with keeping():``, a
-signal raises `KeyboardInterrupt`, so that files are closed. Elsewhere the signal ends the process at once, because a
-library could swallow an exception.
+Ctrl-C and SIGTERM end a command with a sentence and the exit code that shells expect. In a ``with`` block of
+`keeping`, a signal raises `KeyboardInterrupt`, so that files are closed. Elsewhere the signal ends the process at once,
+because a library could swallow an exception.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ class PartTangent:
         """Apply the tangent of `Part.begin`, given the tangent of the state before the step."""
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
-        """Do forward mode for `Part.sort` and `Part.settle`. ``state_dot`` is the tangent of the state before it."""
+        """Do forward mode for `Part.sort` and `Part.settle`, given the tangent of the state before the step."""
 
     def end(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         """Apply the tangent of `Part.end`, and complete ``state_dot``, the tangent of the state after the step."""
