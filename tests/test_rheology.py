@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado
 from bad_scenes import one_sentence
@@ -171,10 +172,25 @@ def beyond(shear_rate, viscosity, slope):
     return viscosity - slope * shear_rate
 
 
-def test_a_law_that_is_negative_is_refused():
-    """As is one that is not finite in the test before."""
-    with pytest.raises(InputError, match=r"beyond returns -\d.* Pa s at a shear rate of 1\.\d*e\+04 1/s"):
-        Simulation(thick(), precision="float64", forces=[Rheology(beyond, slope=1e-4)])
+def root(shear_rate, viscosity, least):
+    return viscosity * wp.sqrt(1.0 - least * shear_rate)
+
+
+def in_time(shear_rate, viscosity, t, slope):
+    return viscosity - slope
+
+
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        (lambda: Rheology(beyond, slope=1e-4), r"beyond returns -\d.* Pa s at a shear rate of 1\.\d*e\+04 1/s"),
+        (lambda: Rheology(root, least=1e-5), "root returns -?nan Pa s at a shear rate of 1"),
+        (lambda: Rheology(in_time, slope=OverTime([0.0, 2.0], [0.0, 2.0])), "in_time returns -0.5 Pa s"),
+    ],
+)
+def test_a_law_that_is_negative_or_not_finite_is_refused(law, said):
+    with pytest.raises(InputError, match=said):
+        Simulation(thick(), precision="float64", forces=[law()])
 
 
 def swirled(shear_rate, viscosity, t, swirl, slope):
