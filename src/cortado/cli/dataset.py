@@ -9,18 +9,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from cortado import errors
 from cortado.calls import counted
 from cortado.cli.arguments import HERE, Where, require_shared
-from cortado.errors import (
-    ComputationError,
-    CortadoWarning,
-    DivergedError,
-    InputError,
-    SceneError,
-    shown,
-    unwarned,
-    warn,
-)
 from cortado.files.disk import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.terminal import keeping, track, untracked
 from cortado.optimisation.dataset_files import PARTS, DatasetFolder, metadata
@@ -53,15 +44,15 @@ class Member:
         require_shared(self.out, "the scene and the folder of a data set")
         folder = DatasetFolder(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():
-            warnings.simplefilter("always", CortadoWarning)
+            warnings.simplefilter("always", errors.CortadoWarning)
             try:
                 simulation = Simulation(self.scene(number), self.device, self.precision)
                 found = one_run(simulation, Sample(self.table, number))
-            except (DivergedError, SceneError, InputError) as error:
+            except (errors.DivergedError, errors.SceneError, errors.InputError) as error:
                 folder.save_failure(number, str(error))
                 return False, []
         folder.save(number, found)
-        return True, [str(one.message) for one in caught if issubclass(one.category, CortadoWarning)]
+        return True, [str(one.message) for one in caught if issubclass(one.category, errors.CortadoWarning)]
 
 
 def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str, precision: str, where: Where) -> str:
@@ -74,16 +65,16 @@ def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str
         purposes = " and ".join(f"one to {part}" for part in parts)
         found = f"--runs is {runs:,}, but must be from {least} to {MOST_RUNS:,}: {purposes} at least"
         advice = "; dataset.valid = 0 and dataset.test = 0 leave the others out" if least > 1 else ""
-        raise InputError(f"{found}{advice}.")
+        raise errors.InputError(f"{found}{advice}.")
     asked = _asked(member)
     if out.suffix in (".h5", ".hdf5"):
-        raise InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
+        raise errors.InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
     with locked(out):
         _claim(file, member.out, asked)
         folder = DatasetFolder(member.out)
         before, known = folder.size, folder.metadata.get("failed", {})
         if runs < before:
-            raise InputError(f"--runs is {runs}, but must be at least {before}: {out} contains as many already.")
+            raise errors.InputError(f"--runs is {runs}, but must be at least {before}: {out} contains as many already.")
         left = [number for number in range(runs) if number not in folder.runs and number not in folder.failures]
 
         def kept() -> str:
@@ -109,7 +100,9 @@ def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str
         with _saying(kept):
             content = _put_together(member, split, runs)
     for path, why in folder.damaged.items():
-        warn(f"{path} was damaged ({why}) and has been made anew; {counted(len(left), 'run')} had to be computed.")
+        errors.warn(
+            f"{path} was damaged ({why}) and has been made anew; {counted(len(left), 'run')} had to be computed."
+        )
     new = {int(number): why for number, why in content["failed"].items() if number not in known}
     _warn({number: sentences[0] for number, sentences in told.items() if sentences}, new, runs)
     if not left and not folder.damaged:
@@ -124,8 +117,8 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
     try:
         with keeping(kept):
             yield
-    except ComputationError as error:
-        raise ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
+    except errors.ComputationError as error:
+        raise errors.ComputationError(f"{str(error).rstrip('.')}. {kept()}.") from error
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
@@ -134,9 +127,9 @@ def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int)
     for purpose, numbers in split.items():
         if numbers and not there[purpose]:
             first = folder.failures[numbers[0]]
-            raise ComputationError(f"None of the runs for {purpose} could be computed. The first: {first}")
+            raise errors.ComputationError(f"None of the runs for {purpose} could be computed. The first: {first}")
     folder.assemble(there)
-    with unwarned():
+    with errors.unwarned():
         content = metadata(member.scene(there["train"][0]), member.table, there, folder, runs)
     folder.write_metadata(content)
     return content
@@ -145,18 +138,20 @@ def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int)
 def _table(file: Path, overrides: list[str]) -> DatasetTable:
     data = read_toml(file, overrides, ("problem", "optimise", "fit"))
     if "dataset" not in data:
-        raise SceneError(str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one")
+        raise errors.SceneError(
+            str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one"
+        )
     try:
         with in_sentences(DatasetTables):
             return DatasetTables(dataset=data["dataset"]).dataset
-    except SceneError as error:
+    except errors.SceneError as error:
         raise error.in_file(str(file)) from None
 
 
 def _asked(member: Member) -> dict[str, Any]:
     """To find mistakes early, the scene is read with the least and with the greatest varied values."""
     table = member.table
-    with unwarned():
+    with errors.unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]
         for end in ends:
             one = load_scene(member.file, [*member.overrides, *end])
@@ -164,17 +159,19 @@ def _asked(member: Member) -> dict[str, Any]:
             bounds_of(one.lasting(steps=table.steps))
         for k, key in enumerate(table.vary):
             others = [*ends[0][:k], *ends[0][k + 1 :]]
-            with suppress(SceneError):  # of an end that is invalid with the lower ends of the others
+            with suppress(errors.SceneError):  # of an end that is invalid with the lower ends of the others
                 made = {load_scene(member.file, [*member.overrides, *others, end[k]]).computed_json() for end in ends}
                 if ends[0][k] != ends[1][k] and len(made) == 1:
-                    raise InputError(f"vary has {key}, which has no effect on what is computed.")
+                    raise errors.InputError(f"vary has {key}, which has no effect on what is computed.")
     for key in table.vary:
         if key in ("solver.time_step", "dimension", "discretisation.spacing") or key.startswith("container."):
-            raise InputError(f"vary has {key}, which must be the same in all runs of a data set.")
-    with unwarned():  # the runs print its warnings
+            raise errors.InputError(f"vary has {key}, which must be the same in all runs of a data set.")
+    with errors.unwarned():  # the runs print its warnings
         scene = load_scene(member.file, member.overrides)
     if len(scene.phase) > (most := KINDS - MORE_FLUID + 1):
-        raise InputError(f"The scene has {len(scene.phase)} phases, but a data set has types for at most {most}.")
+        raise errors.InputError(
+            f"The scene has {len(scene.phase)} phases, but a data set has types for at most {most}."
+        )
     asked = {"scene": json.loads(scene.to_json()), "dataset": table.model_dump(mode="json")}
     for named, key in files_named(asked["scene"]):  # such as meshes
         named[f"{key} content"] = sha256(Path(named[key]).read_bytes()).hexdigest()
@@ -189,13 +186,15 @@ def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
     if note.exists():
         if other := differences(read_json(note), json.loads(json.dumps(asked)), "missing"):
             own = {key.removeprefix("scene."): pair for key, pair in other.items()}
-            unlike = "; ".join(f"{key} is {shown(now)}, but must be {shown(old)}" for key, (old, now) in own.items())
-            raise InputError(f"{file}: {unlike}, as in the data set in {out}; choose another --out.")
+            unlike = "; ".join(
+                f"{key} is {errors.shown(now)}, but must be {errors.shown(old)}" for key, (old, now) in own.items()
+            )
+            raise errors.InputError(f"{file}: {unlike}, as in the data set in {out}; choose another --out.")
         return
     with sentences(out):
         others = [one.name for one in out.iterdir() if one.name != LOCK]
     if others:
-        raise InputError(f"{out} holds {others[0]}, but no data set; choose another --out.")
+        raise errors.InputError(f"{out} holds {others[0]}, but no data set; choose another --out.")
     write_atomically(note, json.dumps(asked, indent=2) + "\n")
 
 
@@ -208,4 +207,4 @@ def _warn(warned: Mapping[int, str], failures: Mapping[int, str], runs: int) -> 
     for found, what in ((warned, "came with a warning"), (failures, "failed and are left out")):
         if found:
             first = min(found)
-            warn(f"{len(found)} of {counted(runs, 'run')} {what}. The first is run {first}: {found[first]}")
+            errors.warn(f"{len(found)} of {counted(runs, 'run')} {what}. The first is run {first}: {found[first]}")

@@ -17,16 +17,10 @@ from cortado.errors import ComputationError, DivergedError, InputError
 from cortado.executors import Executor
 from cortado.files.disk import locked
 from cortado.files.terminal import announce, keeping, say, track
+from cortado.optimisation import solved_task
 from cortado.optimisation.fitting.figures import profile_figure, residual_figure, video_figures
 from cortado.optimisation.fitting.fit import NOISE_ALONE, Fit, Profile, fit, unit_of
 from cortado.optimisation.optimise import Record, Result, optimise
-from cortado.optimisation.solved_task import (
-    FitTask,
-    TaskFigures,
-    load_fit,
-    shaded_figures,
-    task_figures,
-)
 from cortado.optimisation.task_files import Setup, Task, load_task, setup
 from cortado.pictures.film import lacking
 from cortado.pictures.pages import Section, write_report
@@ -83,8 +77,8 @@ def _solved(made: Setup, folder: RunFolder, resume: bool, executor: Executor, pi
     found = Solved(made, result)
     announce("\n".join([found.summary, *found.lines, *found.advice]))
     with keeping(lambda: f"the search has ended, and is in {folder.checkpoint}; --resume draws its pictures"):
-        shaded = shaded_figures(made, result, folder.figures) if shades else TaskFigures()
-        figures = shaded + task_figures(made, result, folder.figures)
+        shaded = solved_task.shaded_figures(made, result, folder.figures) if shades else solved_task.TaskFigures()
+        figures = shaded + solved_task.task_figures(made, result, folder.figures)
         write_report(folder, made.task.scene.name, found.sections(figures))
         folder.write_result(**found.for_machines())
     if found.verdict.failures:
@@ -133,7 +127,7 @@ def _search(made: Setup, folder: RunFolder, resume: bool, executor: Executor) ->
 
 
 def fit_task(task_file: Path, asked: RunRequest) -> str:
-    task = load_fit(task_file, asked.overrides)
+    task = solved_task.load_fit(task_file, asked.overrides)
     experiments = [one.experiment(asked.device, asked.precision) for one in task.experiments]
     with locked(asked.out):
         settings = {"precision": asked.precision, "fit": task.fit.model_dump()}
@@ -158,7 +152,7 @@ def fit_task(task_file: Path, asked: RunRequest) -> str:
     return f"The results are in {folder.path}; open report.html.{doubted}"
 
 
-def fit_sections(task: FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Path) -> list[Section]:
+def fit_sections(task: solved_task.FitTask, fitted: Fit, profiles: Sequence[Profile], folder: Path) -> list[Section]:
     particles, measured = [one.simulation.particles for one in fitted.problem.experiments] if fitted.problem else [], []
     for experiment, count in zip(task.experiments, particles, strict=True):
         what = ", ".join(f"{table.name} ({table.file})" for table in experiment.problem.measured)

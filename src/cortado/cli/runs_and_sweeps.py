@@ -6,20 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from cortado.cli.arguments import (
-    ALL_FRAMES,
-    Device,
-    Flag,
-    FrameOptions,
-    Json,
-    Overrides,
-    Precision,
-    Where,
-    Work,
-    as_text,
-    require_at_least,
-    text_overrides,
-)
+from cortado.cli import arguments
 from cortado.errors import InputError
 from cortado.scene.scene import read_toml
 
@@ -27,8 +14,8 @@ from cortado.scene.scene import read_toml
 def compare(
     first: Annotated[Positional[Path], arg(metavar="RUN")],
     second: Annotated[Positional[Path], arg(metavar="RUN|DATA.csv")],
-    json: Json = False,
-) -> Work:
+    json: arguments.Json = False,
+) -> arguments.Work:
     """Compare two runs, or the sensors of a run with measured data.
 
     Args:
@@ -48,12 +35,12 @@ def sweep(
     time: float | None = None,
     out: Path = Path("runs/sweep"),
     device: str = "cpu",
-    precision: Precision = "float32",
-    frames: FrameOptions = ALL_FRAMES,
-    pictures: Flag = True,
+    precision: arguments.Precision = "float32",
+    frames: arguments.FrameOptions = arguments.ALL_FRAMES,
+    pictures: arguments.Flag = True,
     scheduler: str | None = None,
     workers: int | None = None,
-) -> Work:
+) -> arguments.Work:
     """Run a scene, or optimise a task, with every combination of some values, each in its own folder. Finished runs are
     not repeated.
 
@@ -70,19 +57,19 @@ def sweep(
         workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
     """
     frames.check()
-    combinations, together = as_text(sets), as_text(zips)
+    combinations, together = arguments.as_text(sets), arguments.as_text(zips)
     read_toml(file)
     from cortado.cli.sweep import RunRequest, run_sweep
 
     asked = RunRequest(out, steps, time, device=device, precision=precision, report=pictures)
-    return partial(run_sweep, file, combinations, together, asked, frames, Where(scheduler, workers))
+    return partial(run_sweep, file, combinations, together, asked, frames, arguments.Where(scheduler, workers))
 
 
 def convergence(
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
     quantities: Annotated[UseAppendAction[tuple[str, ...]], arg(name="quantity", metavar="FILE.py:FUNCTION")] = (),
-    json: Json = False,
-) -> Work:
+    json: arguments.Json = False,
+) -> arguments.Work:
     """Compute the order, the limit and the error of convergence from runs with different spacings or time steps.
 
     Args:
@@ -91,19 +78,19 @@ def convergence(
     """
     from cortado.cli.compare import convergence_table
 
-    return partial(convergence_table, runs, as_text(quantities), json)
+    return partial(convergence_table, runs, arguments.as_text(quantities), json)
 
 
 def dataset(
     file: Annotated[Positional[Path], arg(metavar="SCENE.toml|TASK.toml")],
     runs: int = 100,
     out: Path = Path("runs/dataset"),
-    overrides: Overrides = (),
+    overrides: arguments.Overrides = (),
     device: str = "cpu",
-    precision: Precision = "float32",
+    precision: arguments.Precision = "float32",
     scheduler: str | None = None,
     workers: int | None = None,
-) -> Work:
+) -> arguments.Work:
     """Compute many runs of a scene with varied values, as training data for learned simulators. Repeating the command
     computes missing runs, and a larger number of runs extends the data set.
 
@@ -116,23 +103,23 @@ def dataset(
         scheduler: Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers compute.
         workers: Number of worker processes on this machine; with "cuda" each worker has its own GPU.
     """
-    words = text_overrides(file, overrides)
+    words = arguments.text_overrides(file, overrides)
     from cortado.cli.dataset import make_dataset
 
-    return partial(make_dataset, file, runs, out, words, device, precision, Where(scheduler, workers))
+    return partial(make_dataset, file, runs, out, words, device, precision, arguments.Where(scheduler, workers))
 
 
 def picture(
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN|SWEEP")],
     frame: int | None = None,
-    film: Flag = False,
+    film: arguments.Flag = False,
     lines: int | None = None,
     camera: str | None = None,
     colour: str | None = None,
     out: Path | None = None,
-    overrides: Overrides = (),
-    device: Device = "cpu",
-) -> Work:
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
+) -> arguments.Work:
     """Draw a shaded picture or a film of a run that `cortado run` wrote, or of several runs side by side.
 
     Args:
@@ -145,7 +132,7 @@ def picture(
         out: File to write (film: .mp4 or .webp); if left out, in the run's figures, or beside several runs.
         overrides: Replace a key of [picture], such as picture.width=1920; may be given again.
     """
-    words = as_text(overrides)
+    words = arguments.as_text(overrides)
     if film and frame is not None:
         raise InputError("--frame is given, but must be left out, as --film has all frames.")
     if lines is not None:
@@ -166,8 +153,8 @@ def export(
     to: Literal["usd", "glb", "ply", "obj", "vtp"],
     out: Path | None = None,
     every: int = 1,
-    overrides: Overrides = (),
-) -> Work:
+    overrides: arguments.Overrides = (),
+) -> arguments.Work:
     """Export the surface, particles and solids of a run over time for other programs.
 
     Args:
@@ -177,8 +164,8 @@ def export(
         every: Write only every n-th frame of the run, such as 2 for every second frame.
         overrides: Replace a key of [picture], such as picture.colour=speed; may be given again.
     """
-    require_at_least(1, every, "--every")
-    words = as_text(overrides)
+    arguments.require_at_least(1, every, "--every")
+    words = arguments.as_text(overrides)
     for word in words:
         if word.partition("=")[0].strip() not in ("picture.colour", "picture.surface"):
             wanted = "must replace picture.colour or picture.surface: other keys only affect pictures"
@@ -190,11 +177,11 @@ def export(
 
 def view(
     path: Annotated[Positional[Path], arg(metavar="RUN|SCENE.toml")],
-    overrides: Overrides = (),
-    device: Device = "cpu",
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
     precision: str | None = None,
     port: int = 8080,
-) -> Work:
+) -> arguments.Work:
     """Show a run in the browser, or run a scene there, with sliders for gravity; Ctrl-C ends it.
 
     Args:
@@ -205,7 +192,7 @@ def view(
     """
     from cortado.cli.views import view as show
 
-    return partial(show, path, as_text(overrides), device, precision, port)
+    return partial(show, path, arguments.as_text(overrides), device, precision, port)
 
 
 def _refuse(overrides: list[str], keys: tuple[str, ...], why: str) -> None:

@@ -14,27 +14,8 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from cortado.cli.arguments import (
-    ALL_FRAMES,
-    Device,
-    Flag,
-    FrameOptions,
-    Json,
-    Overrides,
-    Precision,
-    Program,
-    Scene,
-    Task,
-    Where,
-    Work,
-    as_text,
-    command,
-    command_line,
-    require_at_least,
-    require_one_of_both,
-    steps_or_time,
-    text_overrides,
-)
+from cortado.cli import arguments
+from cortado.cli.arguments import command
 from cortado.cli.runs_and_sweeps import compare, convergence, dataset, export, picture, sweep, view
 from cortado.errors import InputError, shown
 from cortado.files.disk import SCHEMA, examples_folder, is_taken, make_folder, write_atomically
@@ -47,17 +28,17 @@ app = SubcommandApp()
 
 @command(gradients, answers=True)
 def check(
-    scene: Scene,
+    scene: arguments.Scene,
     steps: int = 50,
     parameters: tuple[str, ...] = ("gravity",),
     loss: str = "positions",
     perturbation: float = 0.05,
     out: Path | None = None,
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    json: Flag = False,
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
+    json: arguments.Flag = False,
     seed: int = 0,
-) -> Work:
+) -> arguments.Work:
     """Check a scene's gradients in float64: whether they are right, up to which step they are useful, and which
     estimator suits longer runs.
 
@@ -72,8 +53,8 @@ def check(
         json: Print JSON for machines instead of a table.
         seed: Seed of the random directions.
     """
-    require_at_least(0, seed, "--seed")
-    words = text_overrides(scene, overrides)
+    arguments.require_at_least(0, seed, "--seed")
+    words = arguments.text_overrides(scene, overrides)
     from cortado.cli.describe import check_scene
 
     return partial(check_scene, scene, steps, parameters, loss, perturbation, out, words, device, json, seed)
@@ -85,7 +66,7 @@ app.command(gradients, name="gradients", help="Check the gradients of a scene.")
 @command(app)
 def new(
     name: Annotated[Positional[Path], arg(metavar="NAME")], template: str = "dam", dimension: int | None = None
-) -> Work:
+) -> arguments.Work:
     """Write a commented scene file that can be run at once, and the schema for editors.
 
     Args:
@@ -100,7 +81,7 @@ def new(
 @command(app, answers=True)
 def examples(
     copy: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (), to: Path | None = None
-) -> Work:
+) -> arguments.Work:
     """List the examples that come with Cortado, or copy some of them.
 
     Args:
@@ -109,21 +90,21 @@ def examples(
     """
     if to is not None and not copy:
         raise InputError("--to is given, but must be left out, as --copy is not given.")
-    return partial(list_examples, as_text(copy), to or Path())
+    return partial(list_examples, arguments.as_text(copy), to or Path())
 
 
 @command(app, answers=True)
 def describe(
-    scene: Scene,
+    scene: arguments.Scene,
     steps: int | None = None,
     time: float | None = None,
-    frames: FrameOptions = ALL_FRAMES,
+    frames: arguments.FrameOptions = arguments.ALL_FRAMES,
     picture: Path | None = None,
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    precision: Precision = "float32",
-    json: Json = False,
-) -> Work:
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
+    precision: arguments.Precision = "float32",
+    json: arguments.Json = False,
+) -> arguments.Work:
     """Describe a scene before a run: its particles, time step limits, memory, computing time, size on disk and length
     of the film.
 
@@ -135,8 +116,8 @@ def describe(
         overrides: Replace a value of the scene, such as solver.time_step=0.002; may be given again.
     """
     frames.check()
-    steps = steps_or_time(steps, time)
-    words = text_overrides(scene, overrides)
+    steps = arguments.steps_or_time(steps, time)
+    words = arguments.text_overrides(scene, overrides)
     from cortado.cli.describe import RunRequest, describe_scene
 
     asked = RunRequest(Path("runs/run"), steps, time, words, device, precision, frames.choice())
@@ -145,20 +126,20 @@ def describe(
 
 @command(app)
 def run(
-    scene: Scene,
+    scene: arguments.Scene,
     steps: int | None = None,
     time: float | None = None,
     out: Path = Path("runs/run"),
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    precision: Precision = "float32",
-    frames: FrameOptions = ALL_FRAMES,
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
+    precision: arguments.Precision = "float32",
+    frames: arguments.FrameOptions = arguments.ALL_FRAMES,
     state: Path | None = None,
-    resume: Flag = False,
-    overwrite: Flag = False,
-    pictures: Flag = True,
+    resume: arguments.Flag = False,
+    overwrite: arguments.Flag = False,
+    pictures: arguments.Flag = True,
     record: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = (),
-) -> Work:
+) -> arguments.Work:
     """Run a scene forward and write its trajectory.
 
     Args:
@@ -173,10 +154,14 @@ def run(
         pictures: Leave out the shaded pictures and the film.
         record: A quantity of the particles to record in every frame, such as pressure or vorticity; may be given again.
     """
-    require_one_of_both(resume, overwrite)
+    arguments.require_one_of_both(resume, overwrite)
     frames.check()
-    steps = steps_or_time(steps, time)
-    wanted, words, told = as_text(record), text_overrides(scene, overrides), command_line()
+    steps = arguments.steps_or_time(steps, time)
+    wanted, words, told = (
+        arguments.as_text(record),
+        arguments.text_overrides(scene, overrides),
+        arguments.command_line(),
+    )
     from cortado.cli.run import RunRequest, run_scene
 
     asked = (steps, time, words, device, precision, frames.choice(), wanted, state, resume, overwrite, pictures, told)
@@ -188,17 +173,17 @@ command(app, answers=True)(compare)
 
 @command(app)
 def optimise(
-    task: Task,
+    task: arguments.Task,
     out: Path = Path("runs/optimise"),
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    precision: Precision = "float32",
-    resume: Flag = False,
-    overwrite: Flag = False,
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
+    precision: arguments.Precision = "float32",
+    resume: arguments.Flag = False,
+    overwrite: arguments.Flag = False,
     scheduler: str | None = None,
     workers: int | None = None,
-    pictures: Flag = True,
-) -> Work:
+    pictures: arguments.Flag = True,
+) -> arguments.Work:
     """Optimise the parameters that a task file names, and check the result against the goals in the file.
 
     Args:
@@ -211,23 +196,25 @@ def optimise(
         workers: Number of local worker processes for the samples; with "cuda" each worker has its own GPU.
         pictures: Leave out the shaded pictures and the films.
     """
-    require_one_of_both(resume, overwrite)
-    words, told = text_overrides(task, overrides), command_line()
+    arguments.require_one_of_both(resume, overwrite)
+    words, told = arguments.text_overrides(task, overrides), arguments.command_line()
     from cortado.cli.optimise import RunRequest, optimise_task
 
     asked = RunRequest(out, None, None, words, device, precision, overwrite=overwrite, command=told)
-    return partial(optimise_task, task, replace(asked, resume=resume, pictures=pictures), Where(scheduler, workers))
+    return partial(
+        optimise_task, task, replace(asked, resume=resume, pictures=pictures), arguments.Where(scheduler, workers)
+    )
 
 
 @command(app, answers=True)
 def fit(
-    task: Task,
+    task: arguments.Task,
     out: Path = Path("runs/fit"),
-    overrides: Overrides = (),
-    device: Device = "cpu",
-    precision: Precision = "float32",
-    overwrite: Flag = False,
-) -> Work:
+    overrides: arguments.Overrides = (),
+    device: arguments.Device = "cpu",
+    precision: arguments.Precision = "float32",
+    overwrite: arguments.Flag = False,
+) -> arguments.Work:
     """Fit parameters with error bars to measured experiments, such as a video or a time series of forces.
 
     Args:
@@ -236,7 +223,7 @@ def fit(
         overrides: Replace a value of the file, such as fit.profiles=0; may be given again.
         overwrite: Replace an earlier run in the same folder.
     """
-    words, told = text_overrides(task, overrides), command_line()
+    words, told = arguments.text_overrides(task, overrides), arguments.command_line()
     from cortado.cli.optimise import RunRequest, fit_task
 
     asked = RunRequest(out, None, None, words, device, precision, overwrite=overwrite, command=told)
@@ -250,7 +237,7 @@ command(app)(dataset)
 
 
 @command(app, answers=True)
-def schema() -> Work:
+def schema() -> arguments.Work:
     """Print the JSON schema of scenes and tasks, with which editors complete and check files."""
     from cortado.optimisation.task_tables import file_schema_text
 
@@ -258,7 +245,7 @@ def schema() -> Work:
 
 
 @command(app, answers=True)
-def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="SHELL")]) -> Work:
+def completion(shell: Annotated[Positional[Literal["bash", "zsh"]], arg(metavar="SHELL")]) -> arguments.Work:
     """Print the completion script of a shell. To load it, use: eval "$(cortado completion bash)".
 
     Args:
@@ -308,7 +295,7 @@ def overview() -> str:
 
 
 SUMMARY = "A differentiable SPH fluid simulator. --version prints which one; cortado alone gives examples."
-CORTADO = Program("cortado", app, SUMMARY, overview)
+CORTADO = arguments.Program("cortado", app, SUMMARY, overview)
 DAM = "dam"
 """Name of the template with a comment on every line."""
 TEMPLATES = Path(__file__).with_name("templates")
