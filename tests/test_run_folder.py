@@ -19,8 +19,7 @@ from cortado import InputError
 from cortado.cli import main
 from cortado.files.disk import unfinished
 from cortado.files.terminal import track
-from cortado.pictures.pages import Section, write_report, written
-from cortado.pictures.particle_view import Cloud, particle_view, thinned
+from cortado.pictures.pages import Cloud, Section, particle_view, thinned, write_report, written
 from cortado.runs.run_folder import RunFolder
 
 SCENE = '{"name": "drop", "dimension": 2}'

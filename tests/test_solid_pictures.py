@@ -9,8 +9,8 @@ import warp as wp
 import cortado
 from cortado.device.launching import BandLauncher
 from cortado.discretise.shapes import corners
+from cortado.pictures.pages import container_outline, outline, scene_view
 from cortado.pictures.painter import colours_of, painter
-from cortado.pictures.particle_view import container_outline, outline, scene_view
 from cortado.pictures.plots import particles
 from cortado.pictures.shown_solids import FAR, SolidMesh, shown_solids, solid_outline
 from cortado.pictures.stage import Stage, screen_axes

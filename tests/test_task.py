@@ -9,7 +9,7 @@ import pytest
 from bad_scenes import one_sentence
 from bad_tasks import BAD_TASKS, GOOD_TASK
 from cortado import SceneError, gradients, optimise
-from cortado.cli.optimise_report import found_in_words, judge
+from cortado.cli.optimise import found_in_words, judge
 from cortado.optimisation.optimise import Record, Result
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent
 from cortado.optimisation.solved_task import knot_values

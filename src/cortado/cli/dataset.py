@@ -14,8 +14,18 @@ from cortado.calls import counted
 from cortado.cli.arguments import HERE, Where, require_shared
 from cortado.files.disk import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.terminal import keeping, track, untracked
-from cortado.optimisation.dataset_files import PARTS, DatasetFolder, metadata
-from cortado.optimisation.datasets import KINDS, MORE_FLUID, DatasetTable, DatasetTables, Sample, bounds_of, one_run
+from cortado.optimisation.datasets import (
+    KINDS,
+    MORE_FLUID,
+    PARTS,
+    DatasetFolder,
+    DatasetTable,
+    DatasetTables,
+    Sample,
+    bounds_of,
+    metadata,
+    one_run,
+)
 from cortado.runs.run_folder import differences, read_json
 from cortado.scene.scene import Scene, files_named, load_scene, overrides_of, read_toml
 from cortado.scene.tables import MISSING

@@ -19,8 +19,7 @@ from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
 from cortado.particles.state import State
 from cortado.pictures.film import coloured_by, is_out, lacking
-from cortado.pictures.pages import Figures, Section, write_report
-from cortado.pictures.particle_view import scene_view
+from cortado.pictures.pages import Figures, Section, scene_view, write_report
 from cortado.pictures.plots import images, particles
 from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline

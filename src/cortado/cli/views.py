@@ -18,8 +18,8 @@ from cortado.files.image_encoding import to_srgb
 from cortado.files.terminal import keeping, say
 from cortado.losses.loss import ADJOINT_FIELDS
 from cortado.pictures.film import is_out
+from cortado.pictures.pages import container_outline, outline
 from cortado.pictures.painter import colours_of
-from cortado.pictures.particle_view import container_outline, outline
 from cortado.pictures.shown_solids import ShownSolid, own_faces, own_lines, shown_solids
 from cortado.pictures.stage import upright
 from cortado.runs.frames import SolidMotions, posed, sized
