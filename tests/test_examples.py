@@ -10,6 +10,7 @@ from pathlib import Path
 import matplotlib.pyplot
 import numpy as np
 import pytest
+import warp as wp
 
 import cortado.cli.describe
 import cortado.cli.optimise
@@ -189,6 +190,19 @@ def test_the_readme_has_commands_files_and_targets_that_are_there():
 FOLDERS = ("examples", "docs/figures", "experiments/scenes")
 FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.toml"))]
 TASKS = [path for path in FILES if "[optimise]" in path.read_text(encoding="utf-8")]
+
+
+ON_A_GPU = {"latte_art", "latte_art_heart", "latte_art_large", "long_dam_break", "pour", "recover_gravity"}
+
+
+@pytest.mark.parametrize("name", [path.stem for path in TASKS if path.parent == FOLDER])
+def test_a_search_meets_its_own_check(name, tmp_path, cortado_command):
+    """As users run it, but for its films: other tests shorten what they take from these files."""
+    if name in ON_A_GPU and not wp.is_cuda_available():
+        pytest.skip("there is no CUDA device")
+    options = ["--device", "cuda:0" if name in ON_A_GPU else "cpu", "--no-pictures", "--out", tmp_path / "run"]
+    code, said, wrong = cortado_command("optimise", f"examples/{name}.toml", *options)
+    assert code == 0, said + wrong
 
 
 def loaded(path: Path) -> None:
