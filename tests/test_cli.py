@@ -38,7 +38,7 @@ def folder(tmp_path, monkeypatch, unrendered):
     monkeypatch.chdir(tmp_path)
     # tests/test_shading.py draws them
     monkeypatch.setattr("cortado.cli.run_report.run_pictures", lambda *_: [])
-    monkeypatch.setattr("cortado.cli.optimise.shaded_figures", lambda *_: TaskFigures())
+    monkeypatch.setattr("cortado.optimisation.solved_task.shaded_figures", lambda *_: TaskFigures())
     return tmp_path
 
 
