@@ -6,10 +6,11 @@ import pytest
 from PIL import Image
 
 from cortado import ComputationError, InputError, Trajectory
-from cortado.files.image_encoding import BITS, moving_picture, to_srgb, write_video, writing
+from cortado.files.image_encoding import to_srgb
 from cortado.pictures import plots
 from cortado.pictures.image_files import COFFEE, MILK, heart
 from cortado.pictures.run_pictures import density_errors
+from cortado.pictures.video_files import BITS, moving_picture, write_video, writing
 from full_disk import largest_file
 
 

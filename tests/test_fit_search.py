@@ -16,13 +16,13 @@ import cortado
 from bad_scenes import assert_one_sentence, one_sentence
 from cortado.errors import CortadoError, CortadoWarning, DivergedError, InputError
 from cortado.files.disk import read_columns
-from cortado.files.image_encoding import write_video
 from cortado.measured import Experiment
 from cortado.optimisation.fitting.gauss_newton import least, next_point, search
 from cortado.optimisation.fitting.least_squares import Coordinates, LeastSquares, Weighting
 from cortado.optimisation.solved_task import load_fit
 from cortado.optimisation.task_files import load_task
 from cortado.pictures.image_files import read_frames, write_picture
+from cortado.pictures.video_files import write_video
 from cortado.scene.parameters import Range
 
 TIMES = np.linspace(0.0, 2.0, 40)

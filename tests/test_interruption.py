@@ -191,7 +191,7 @@ def test_limits_of_a_shell(tmp_path, limit, word):
 def test_a_library_that_does_not_fit_is_not_called_missing(monkeypatch):
     for error in (OSError(errno.EACCES, "no"), RuntimeError("no"), ImportError("undefined symbol")):
         assert shortage(error) is None
-    from cortado.files.image_encoding import pyav
+    from cortado.pictures.video_files import pyav
 
     real = builtins.__import__
 

@@ -59,7 +59,7 @@ MODULES = modules()
 SOURCES = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
 MOST_PACKAGES = 17
 MOST_LINES = 450
-ON_TOP = ("pictures", "environments", "certificate", "cli", "__main__", "measured")
+ON_TOP = ("pictures", "environments", "certificate", "cli", "runs.run_folder", "__main__", "measured")
 ON_TOP += tuple(f"optimisation.{name}" for name in ("datasets", "fitting"))
 ON_TOP += tuple(f"optimisation.{name}" for name in ("solved_task", "task_files", "task_tables"))
 """Packages, and modules, that lie on top of the core; `cortado` itself has the names of all."""

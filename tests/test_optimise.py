@@ -10,11 +10,11 @@ import pytest
 
 import cortado
 from cortado import ComputationError, CortadoWarning, DivergedError, InputError, Problem, Simulation
+from cortado.files.disk import REPLAY_LOG
 from cortado.gradients import EnsembleMean, Estimate
 from cortado.losses import FinalPositions
 from cortado.optimisation.optimise import Record, Result, optimise
 from cortado.optimisation.optimisers import LBFGS, Adam, GradientDescent, LineSearch
-from cortado.runs.run_folder import REPLAY_LOG
 from rosenbrock_valley import Interrupted, Rosenbrock, rosenbrock
 from scenes import plane
 

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 from cortado.errors import InputError
 from cortado.files.disk import sentences
-from cortado.files.image_encoding import pyav
+from cortado.pictures.video_files import pyav
 
 WIDTH, HEIGHT = 0.16, 0.08
 """Of what the camera sees [m]."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from cortado.calls import counted
 from cortado.discretise.room import TOLERANCE
-from cortado.files.image_encoding import write_video
 from cortado.files.terminal import say
 from cortado.particles.state import State
 from cortado.pictures.film import coloured_by, is_out, lacking
@@ -23,6 +22,7 @@ from cortado.pictures.pages import Figures, Section, scene_view, write_report
 from cortado.pictures.plots import images, particles
 from cortado.pictures.run_pictures import density_errors, readings, run_pictures
 from cortado.pictures.shown_solids import solid_outline
+from cortado.pictures.video_files import write_video
 from cortado.rollout.rollout import Rollout
 from cortado.rollout.run_checks import divergence_sentence, dry_sentence, not_converged_sentence
 from cortado.runs.frames import Pace, SolidMotions, common_rate, posed

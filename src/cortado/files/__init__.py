@@ -1,4 +1,4 @@
-"""Files, locks, encoding of films, and messages on terminals."""
+"""Files, locks, encoding of pictures, and messages on terminals."""
 
 from typing import TYPE_CHECKING
 

@@ -141,6 +141,8 @@ def examples_folder() -> Path:
     return installed if installed.is_dir() else _PACKAGE.parents[1] / "examples"
 
 
+REPLAY_LOG = "replay.log"
+"""Name of the file with the evaluations of a search."""
 UNFINISHED = ".cortado-*.tmp"
 """Pattern of the names of temporary files. A killed process may leave temporary files behind."""
 _REFUSALS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)

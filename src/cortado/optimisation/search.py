@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cortado.errors import ComputationError, InputError
-from cortado.files.disk import parsed_json, sentences, write_atomically, write_fully
-from cortado.runs.run_folder import REPLAY_LOG
+from cortado.files.disk import REPLAY_LOG, parsed_json, sentences, write_atomically, write_fully
 
 Vector = npt.NDArray[np.float64]
 FORMAT = "cortado replay log 1"

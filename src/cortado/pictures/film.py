@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.errors import InputError
-from cortado.files.image_encoding import moving_picture
 from cortado.files.terminal import track
 from cortado.pictures.painter import Scale, colours_of, stage_of
 from cortado.pictures.plane import PlanePainter, PlaneStage
 from cortado.pictures.stage import Stage, upright
 from cortado.pictures.tracing.space import SpacePainter, State
 from cortado.pictures.tracing.steady import WINDOW
+from cortado.pictures.video_files import moving_picture
 from cortado.runs.frames import Film, Pace, SolidMotions, posed, sized
 from cortado.runs.trajectory import Trajectory
 from cortado.scene.appearance import Moment, Picture, View

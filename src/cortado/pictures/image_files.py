@@ -18,7 +18,8 @@ from cortado.calls import public
 from cortado.device.threads import require
 from cortado.errors import InputError, warn
 from cortado.files.disk import as_path, reason, regular_file, write_atomically
-from cortado.files.image_encoding import from_srgb, png, pyav
+from cortado.files.image_encoding import from_srgb, png
+from cortado.pictures.video_files import pyav
 from cortado.render.cameras import check_resolution, positive, vector
 
 Picture = NDArray[np.float64]

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from cortado.errors import LONGEST, InputError, SceneError, shown, unwarned
-from cortado.files.disk import UNFINISHED, content, parsed_json, reason, sentences, write_atomically
+from cortado.files.disk import REPLAY_LOG, UNFINISHED, content, parsed_json, reason, sentences, write_atomically
 from cortado.runs.sensor import Readings, as_csv, from_csv
 from cortado.scene.parameter_values import NAMES
 from cortado.scene.scene import Scene, files_named
@@ -26,7 +26,6 @@ from cortado.version import __version__
 LARGEST = 2**31
 _PACKAGES = ("warp-lang", "numpy", "scipy", "pydantic", "h5py", "matplotlib")
 _FILES = ("scene.json", "metrics.jsonl", "trajectory.vtkhdf", "report.html", "result.json", "sensors.csv")
-REPLAY_LOG = "replay.log"
 _FOLDERS = ("checkpoint", "figures")
 _PLOTS = ("particles", "measured", "rendered", "density_errors", "loss", "images", "progress", "residuals", "profiles")
 _SHADED = ("first", "last", "picture", "found", "search")
