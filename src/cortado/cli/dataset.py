@@ -14,18 +14,7 @@ from cortado.calls import counted
 from cortado.cli.arguments import HERE, Where, require_shared
 from cortado.files.disk import LOCK, UNFINISHED, locked, sentences, write_atomically
 from cortado.files.terminal import keeping, track, untracked
-from cortado.optimisation.datasets import (
-    KINDS,
-    MORE_FLUID,
-    PARTS,
-    DatasetFolder,
-    DatasetTable,
-    DatasetTables,
-    Sample,
-    bounds_of,
-    metadata,
-    one_run,
-)
+from cortado.optimisation import datasets
 from cortado.runs.run_folder import differences, read_json
 from cortado.scene.scene import Scene, files_named, load_scene, overrides_of, read_toml
 from cortado.scene.tables import MISSING
@@ -40,24 +29,24 @@ MOST_RUNS = 100_000
 class Member:
     file: Path
     overrides: tuple[str, ...]
-    table: DatasetTable
+    table: datasets.DatasetTable
     out: Path
     device: str
     precision: str
 
     def scene(self, number: int) -> Scene:
-        overrides = [*self.overrides, *Sample(self.table, number).overrides]
+        overrides = [*self.overrides, *datasets.Sample(self.table, number).overrides]
         return load_scene(self.file, overrides).lasting(steps=self.table.steps)
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
         """Compute and write a run. Return whether it succeeded, and its warnings."""
         require_shared(self.out, "the scene and the folder of a data set")
-        folder = DatasetFolder(self.out)
+        folder = datasets.DatasetFolder(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():
             warnings.simplefilter("always", errors.CortadoWarning)
             try:
                 simulation = Simulation(self.scene(number), self.device, self.precision)
-                found = one_run(simulation, Sample(self.table, number))
+                found = datasets.one_run(simulation, datasets.Sample(self.table, number))
             except (errors.DivergedError, errors.SceneError, errors.InputError) as error:
                 folder.save_failure(number, str(error))
                 return False, []
@@ -81,14 +70,14 @@ def make_dataset(file: Path, runs: int, out: Path, words: list[str], device: str
         raise errors.InputError(f"--out is {out}, but must be a folder, for the files train.h5, valid.h5 and test.h5.")
     with locked(out):
         _claim(file, member.out, asked)
-        folder = DatasetFolder(member.out)
+        folder = datasets.DatasetFolder(member.out)
         before, known = folder.size, folder.metadata.get("failed", {})
         if runs < before:
             raise errors.InputError(f"--runs is {runs}, but must be at least {before}: {out} contains as many already.")
         left = [number for number in range(runs) if number not in folder.runs and number not in folder.failures]
 
         def kept() -> str:
-            now = DatasetFolder(member.out)
+            now = datasets.DatasetFolder(member.out)
             there = f"{sum(k in now.runs or k in now.failures for k in range(runs))} of {counted(runs, 'run')}"
             return f"{there} are finished, in {member.out}; the same command goes on with the rest"
 
@@ -132,7 +121,7 @@ def _saying(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int) -> dict[str, Any]:
-    folder = DatasetFolder(member.out)
+    folder = datasets.DatasetFolder(member.out)
     there = {purpose: [number for number in own if number in folder.runs] for purpose, own in split.items()}
     for purpose, numbers in split.items():
         if numbers and not there[purpose]:
@@ -140,20 +129,20 @@ def _put_together(member: Member, split: Mapping[str, Sequence[int]], runs: int)
             raise errors.ComputationError(f"None of the runs for {purpose} could be computed. The first: {first}")
     folder.assemble(there)
     with errors.unwarned():
-        content = metadata(member.scene(there["train"][0]), member.table, there, folder, runs)
+        content = datasets.metadata(member.scene(there["train"][0]), member.table, there, folder, runs)
     folder.write_metadata(content)
     return content
 
 
-def _table(file: Path, overrides: list[str]) -> DatasetTable:
+def _table(file: Path, overrides: list[str]) -> datasets.DatasetTable:
     data = read_toml(file, overrides, ("problem", "optimise", "fit"))
     if "dataset" not in data:
         raise errors.SceneError(
             str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one"
         )
     try:
-        with in_sentences(DatasetTables):
-            return DatasetTables(dataset=data["dataset"]).dataset
+        with in_sentences(datasets.DatasetTables):
+            return datasets.DatasetTables(dataset=data["dataset"]).dataset
     except errors.SceneError as error:
         raise error.in_file(str(file)) from None
 
@@ -166,7 +155,7 @@ def _asked(member: Member) -> dict[str, Any]:
         for end in ends:
             one = load_scene(member.file, [*member.overrides, *end])
             one.solver.fixed_time_step("a data set")
-            bounds_of(one.lasting(steps=table.steps))
+            datasets.bounds_of(one.lasting(steps=table.steps))
         for k, key in enumerate(table.vary):
             others = [*ends[0][:k], *ends[0][k + 1 :]]
             with suppress(errors.SceneError):  # of an end that is invalid with the lower ends of the others
@@ -178,7 +167,7 @@ def _asked(member: Member) -> dict[str, Any]:
             raise errors.InputError(f"vary has {key}, which must be the same in all runs of a data set.")
     with errors.unwarned():  # the runs print its warnings
         scene = load_scene(member.file, member.overrides)
-    if len(scene.phase) > (most := KINDS - MORE_FLUID + 1):
+    if len(scene.phase) > (most := datasets.KINDS - datasets.MORE_FLUID + 1):
         raise errors.InputError(
             f"The scene has {len(scene.phase)} phases, but a data set has types for at most {most}."
         )
@@ -191,7 +180,7 @@ def _asked(member: Member) -> dict[str, Any]:
 def _claim(file: Path, out: Path, asked: Mapping[str, Any]) -> None:
     """Write the settings of the data set into its folder, and remove unfinished files."""
     note = out / "dataset.json"
-    for left_behind in [*out.glob(UNFINISHED), *(out / PARTS).glob(UNFINISHED)]:
+    for left_behind in [*out.glob(UNFINISHED), *(out / datasets.PARTS).glob(UNFINISHED)]:
         left_behind.unlink(missing_ok=True)
     if note.exists():
         if other := differences(read_json(note), json.loads(json.dumps(asked)), "missing"):

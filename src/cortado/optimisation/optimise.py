@@ -9,15 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cortado.arrays import (
-    as_numbers,
-    as_one_number,
-    is_whole,
-    require_function,
-    require_methods,
-    require_table,
-    require_truth,
-)
+from cortado import arrays
 from cortado.calls import counted, public, sized
 from cortado.errors import InputError, shown, warn
 from cortado.executors import Executor, InProcess, OnResult, checked_executor
@@ -112,7 +104,7 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
         raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
     if not start:
         raise InputError("The start names no parameter to optimise; give one or more, as {'gravity': value}.")
-    found = {name: as_numbers(f"The start of '{name}'", value).copy() for name, value in start.items()}
+    found = {name: arrays.as_numbers(f"The start of '{name}'", value).copy() for name, value in start.items()}
     for name, array in found.items():
         if array.size == 0:
             raise InputError(f"The start of '{name}' has shape {array.shape}, but must have at least one number.")
@@ -133,8 +125,8 @@ def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[st
         pair = bounds.get(name, (None, None))
         try:
             lower, upper = pair
-            low = as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
-            high = as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
+            low = arrays.as_numbers(f"The lower bound of '{name}'", -np.inf if lower is None else lower)
+            high = arrays.as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
             low, high = np.broadcast_to(low, value.shape), np.broadcast_to(high, value.shape)
         except (TypeError, ValueError):
             said = f"The bounds of '{name}' must be (lower, upper), each None"
@@ -179,16 +171,16 @@ def evaluate(
         points = [{"gravity": [0.0, -g]} for g in (9.0, 9.5, 10.0)]
         losses = [found.loss for found in cortado.evaluate(problem, points)]
     """
-    require_function("on_result", on_result, "the number of a point", "its Estimate")
-    require_methods("problem", problem, ("value",), "a cortado.Problem")
+    arrays.require_function("on_result", on_result, "the number of a point", "its Estimate")
+    arrays.require_methods("problem", problem, ("value",), "a cortado.Problem")
     require_points(points, are_read=False)
     if loss_if_diverged is not None:
-        loss_if_diverged = as_one_number("loss_if_diverged", loss_if_diverged)
+        loss_if_diverged = arrays.as_one_number("loss_if_diverged", loss_if_diverged)
     chosen = checked_executor(InProcess() if executor is None else executor)
     estimator = None if gradient is None else checked_estimator(gradient)
 
     def point(values: Values) -> Point:
-        require_table("a point", values, "{'gravity': value}")
+        arrays.require_table("a point", values, "{'gravity': value}")
         return Point(values, estimator, np.nan if loss_if_diverged is None else loss_if_diverged, NO_RUN)
 
     found = evaluated(problem, map(point, points), chosen, on_result=on_result)
@@ -252,14 +244,14 @@ def optimise(
     """
     if checkpoint is not None:
         checkpoint = as_path("checkpoint", checkpoint)
-    require_function("on_iteration", on_iteration, "a record of the iteration")
-    require_truth("resume", resume)
+    arrays.require_function("on_iteration", on_iteration, "a record of the iteration")
+    arrays.require_truth("resume", resume)
     algorithm, differentiable = as_optimiser(optimiser, settings), as_differentiable(problem)
     values = checked_start(start)
     layout = ParameterLayout(tuple(values), tuple(array.shape for array in values.values()))
     lower, upper = map(layout.ravel, checked_bounds({} if bounds is None else bounds, values))
     algorithm.check(layout)
-    if not is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
+    if not arrays.is_whole(iterations) or not 1 <= iterations <= MOST_ITERATIONS:
         wanted = f"an integer of at least 1 and at most {MOST_ITERATIONS:,}"
         raise InputError(f"The number of iterations must be {wanted}, not {shown(iterations)}.")
     identity = {"optimiser": repr(algorithm), "gradient": repr(gradient)}

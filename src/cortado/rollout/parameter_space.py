@@ -10,17 +10,8 @@ from cortado.arrays import as_numbers, as_one_number, check_steps, is_same, requ
 from cortado.device.threads import WARP
 from cortado.errors import InputError, OutOfRangeError, shown, warn
 from cortado.particles.state import Parameters, State
+from cortado.rollout import run_checks
 from cortado.rollout.rollout import Rollout
-from cortado.rollout.run_checks import (
-    FirstPositions,
-    check_places,
-    check_sizes,
-    check_state,
-    dry_sentence,
-    origin_of,
-    path_sentence,
-    unstable_sentence,
-)
 from cortado.rollout.scene_parameters import DENSITY, SceneParameters, Simulated
 from cortado.rollout.step_bounds import ROOM, begin_choosing, counted_steps, expected_steps, greatest_step
 from cortado.rollout.step_sizes import ChosenSteps
@@ -49,7 +40,7 @@ class ParameterSpace:
         self._parameters_dot: tuple[Rollout, Parameters] | None = None
         self._known = simulation.known
         self._one = SceneParameters(simulation, steps)
-        self._first_positions = FirstPositions(simulation)
+        self._first_positions = run_checks.FirstPositions(simulation)
         self._told: set[str] = set()
         self._begun: tuple[Rollout, int, Arrays, frozenset[str]] | None = None
         self._judged: tuple[Arrays, float] | None = None
@@ -80,7 +71,7 @@ class ParameterSpace:
         ]
         if not (changed or is_first):
             return
-        check_sizes({name: values[name] for name in changed}, self._simulation.precision, self._known)
+        run_checks.check_sizes({name: values[name] for name in changed}, self._simulation.precision, self._known)
         for number, own in enumerate(self._different(values)):
             self._check(own, number)
         self._judged = {name: value.copy() for name, value in values.items()}, strength
@@ -151,14 +142,14 @@ class ParameterSpace:
             for own, clock in zip(members, clocks, strict=True)
         ]
         courses = self._one.courses(members[0])
-        self._warn(path_sentence(simulation.scene, rollout.initial, members[0], chosen[0], courses))
+        self._warn(run_checks.path_sentence(simulation.scene, rollout.initial, members[0], chosen[0], courses))
         rollout.time_steps[:] = [one["time_step"] for one in chosen]
-        origins = [origin_of(simulation, one["rest_density"]) for one in chosen]
+        origins = [run_checks.origin_of(simulation, one["rest_density"]) for one in chosen]
         shared = {one: one for one in origins}  # equal origins are one object, because a batch has hundreds
         rollout.origins = [shared[one] for one in origins] * (len(rollout.clocks) // len(origins))
         rollout.parameters.set(stacked(chosen))
         if not simulation.scene.solver.chooses:
-            self._warn(dry_sentence(simulation.scene, rollout))
+            self._warn(run_checks.dry_sentence(simulation.scene, rollout))
         substeps = {simulation.substeps(**{name: one[name] for name in DIFFUSION}) for one in chosen}
         if len(substeps) > 1:
             found = f"{' and '.join(map(str, sorted(substeps)))} explicit steps of diffusion in a time step"
@@ -219,8 +210,10 @@ class ParameterSpace:
                 raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
         simulation = self._simulation
         for state, own in zip(states, self.members(values), strict=False):
-            origin = origin_of(simulation, np.atleast_1d(own.get("rest_density", self._one.values["rest_density"])))
-            check_state(state, origin, simulation)
+            origin = run_checks.origin_of(
+                simulation, np.atleast_1d(own.get("rest_density", self._one.values["rest_density"]))
+            )
+            run_checks.check_state(state, origin, simulation)
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
@@ -321,7 +314,7 @@ class ParameterSpace:
         if self._steps == 0:
             return
         try:
-            check_places(values, simulation.scene, simulation.free_particles)
+            run_checks.check_places(values, simulation.scene, simulation.free_particles)
             crowded = self._first_positions.check(values, number)
             for maker in simulation.forces:
                 if hasattr(maker, "check"):
@@ -329,7 +322,9 @@ class ParameterSpace:
         except InputError as error:
             place = "" if self._batch is None else f"In scene {number} of the batch, "
             raise OutOfRangeError(f"{place}{error}") from error
-        unstable = unstable_sentence(self._one.upright(values), simulation.scene, self._told) if values else None
+        unstable = (
+            run_checks.unstable_sentence(self._one.upright(values), simulation.scene, self._told) if values else None
+        )
         for sentence in filter(None, (crowded, unstable)):
             warn(sentence)
 

@@ -30,19 +30,8 @@ from cortado.scene.scene import Scene
 from cortado.scene.shape_tables import NoContainer
 from cortado.scene.solids import SolidTable
 from cortado.scene.solvers import PackageSolver, SolverTable
+from cortado.solvers import obstacles
 from cortado.solvers.contacts import Contacts, Touching
-from cortado.solvers.obstacles import (
-    FINE,
-    ON,
-    FlatFaces,
-    NamedSolid,
-    Obstacle,
-    Walled,
-    drained_of,
-    flat_faces,
-    nozzles_of,
-    placed_sheets,
-)
 from cortado.solvers.particles import ParticleSystem
 from cortado.solvers.solver import Solver
 from cortado.sph.drains import Drains
@@ -223,16 +212,16 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     scene, discrete, precision, device = setting.scene, setting.discrete, setting.precision, setting.device
     layout = Layout(len(discrete.fluid.positions), len(scene.phase), precision, device, setting.batch, setting.known)
     lanes, numbers = lanes_for(layout.particles, device, setting.lanes), wall_numbers(scene.solid)
-    drains, spacing = drained_of(scene, discrete, precision), scene.discretisation.spacing
+    drains, spacing = obstacles.drained_of(scene, discrete, precision), scene.discretisation.spacing
     shared = Discretisation(discrete.kernel, precision, lanes, any(discrete.periods), bool(moving(scene.solid)))
-    mirrors, placed = mirrors_of(scene), placed_sheets(scene)
+    mirrors, placed = mirrors_of(scene), obstacles.placed_sheets(scene)
     most = MOST_FACES if layout.all_particles <= most_imaged(moving=True) else 0
-    faces = flat_faces(scene, discrete.lattice.support, most)
+    faces = obstacles.flat_faces(scene, discrete.lattice.support, most)
     search = _search(setting, shared, layout, bool(np.isfinite(mirrors).any()), faces)
     sheets = Sheets(placed, spacing, layout) if placed else None
 
-    def obstacle(table: SolidTable, solid: Solid) -> Obstacle:
-        return Obstacle(table.name, solid, table.side == "inside", table.thinnest(spacing))
+    def obstacle(table: SolidTable, solid: Solid) -> obstacles.Obstacle:
+        return obstacles.Obstacle(table.name, solid, table.side == "inside", table.thinnest(spacing))
 
     still = [obstacle(table, table.solid()) for table in scene.solid if not table.moves]
     moved = [obstacle(table, table.own_solid()) for table in moving(scene.solid)]
@@ -240,8 +229,8 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
     holds, solids = (scene.container, (still, moved)) if scene.forces.pressure else (NoContainer(), ([], []))
     region = holds.region(scene.dimension).opened(discrete.periods)
     free = _free_solids(setting, search, layout, still, moved)
-    walled = Walled(region, discrete.near, spacing, tuple(solids[0]), tuple(solids[1]), discrete.periods)
-    named = {one.name: NamedSolid(numbers[one.name], padded(one.middle()[None])[0]) for one in scene.solid}
+    walled = obstacles.Walled(region, discrete.near, spacing, tuple(solids[0]), tuple(solids[1]), discrete.periods)
+    named = {one.name: obstacles.NamedSolid(numbers[one.name], padded(one.middle()[None])[0]) for one in scene.solid}
     around = 0 if drains else discrete.fluid.emitted.start, walled, mirrors, faces, named, sheets
 
     def system(own: Discretisation) -> ParticleSystem:
@@ -254,7 +243,7 @@ def particle_system(setting: SolverSetting) -> ParticleSystem:
 
 
 def _search(
-    setting: SolverSetting, discretisation: Discretisation, layout: Layout, mirrored: bool, faces: FlatFaces
+    setting: SolverSetting, discretisation: Discretisation, layout: Layout, mirrored: bool, faces: obstacles.FlatFaces
 ) -> NeighbourSearch:
     scene, discrete, spacing = setting.scene, setting.discrete, setting.scene.discretisation.spacing
     near, support, walls = discrete.near, discrete.lattice.support, discrete.walls
@@ -267,7 +256,7 @@ def _search(
     free = [number for number, table in enumerate(moving(scene.solid)) if table.motion == "free"]
     grips = walls.weights * (walls.sticks & ~np.isin(walls.solid, free))  # `FreeFriction` has that of free bodies
     positions, feet = padded(positions), padded(feet)
-    behind = faces.behind(walls.solid, positions, feet, ON * spacing)
+    behind = faces.behind(walls.solid, positions, feet, obstacles.ON * spacing)
     arrays = WallArrays(positions, walls.weights, grips, feet, padded(walls.slides), walls.solid, behind)
     room, imaged = first_capacity(support / spacing, scene.dimension), mirrored or len(faces.solids) > 0
     return NeighbourSearch(discretisation, grid, arrays, layout, room, len(middles), scene.dimension, imaged)
@@ -309,7 +298,7 @@ def _parts(
         mobility = MOBILITIES[scene.mixture.mobility_form]
         diffusion = Diffusion(discretisation, count, setting.free_energy, mobility)
         phases = Phases(count, diffusion, scene.mixture.strength)
-    found: list[PartMaker] = [phases, *nozzles_of(scene, setting.discrete), *([free] if free else [])]
+    found: list[PartMaker] = [phases, *obstacles.nozzles_of(scene, setting.discrete), *([free] if free else [])]
     if tables := moving(scene.solid):  # this also writes the walls of free bodies
         numbers = {table.name: number for number, table in enumerate(tables) if table.motion != "free"}
         found.append(MovingSolids(numbers, scene.dimension, search))
@@ -317,7 +306,11 @@ def _parts(
 
 
 def _free_solids(
-    setting: SolverSetting, search: NeighbourSearch, layout: Layout, still: list[Obstacle], moved: list[Obstacle]
+    setting: SolverSetting,
+    search: NeighbourSearch,
+    layout: Layout,
+    still: list[obstacles.Obstacle],
+    moved: list[obstacles.Obstacle],
 ) -> FreeSolids | None:
     scene, discrete, spacing = setting.scene, setting.discrete, setting.scene.discretisation.spacing
     walls, solids = discrete.walls, moving(scene.solid)
@@ -325,7 +318,7 @@ def _free_solids(
     if not bodies:
         return None
     sides = scene.container.solids(scene.dimension, discrete.lattice.support)
-    fixed = [*(Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides), *still]
+    fixed = [*(obstacles.Obstacle("container", side, isinstance(side, Hollow), np.inf) for side in sides), *still]
     tables, touching = [], []
     for body, number in enumerate(bodies):
         table, own = solids[number], walls.solid == number
@@ -334,7 +327,7 @@ def _free_solids(
         tables.append(FreeTable(table.name, number, weight_name(table), mass, hold, table.sticks))
         feet = walls.positions[own] - table.middle() + walls.feet[own]
         near = feet[np.linalg.norm(walls.feet[own], axis=1) < spacing] @ table.turn(scene.dimension)
-        points = np.concatenate([near, table.own_solid().faces(FINE * spacing).vertices])
+        points = np.concatenate([near, table.own_solid().faces(obstacles.FINE * spacing).vertices])
         touching.append(Touching(body, -1, -1, fixed, points))
         for against, one in enumerate(solids):
             if against != number:

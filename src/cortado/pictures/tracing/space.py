@@ -19,6 +19,7 @@ from cortado.device.threads import WARP
 from cortado.discretise.shapes import Points
 from cortado.pictures.shown_solids import ShownSolid
 from cortado.pictures.stage import Stage, screen_axes
+from cortado.pictures.tracing import trace
 from cortado.pictures.tracing.backdrop import EDGE, GLASS_BOX, GLASS_CYLINDER, NO_GLASS, Environment
 from cortado.pictures.tracing.liquid_surface import Level, Mesh, liquid_level, liquid_surface, spheres
 from cortado.pictures.tracing.near_particles import (
@@ -34,18 +35,6 @@ from cortado.pictures.tracing.near_particles import (
 )
 from cortado.pictures.tracing.solid_surfaces import DeviceSurface, FloorShadow, SolidSurfaces, cast
 from cortado.pictures.tracing.steady import steadied, still_of
-from cortado.pictures.tracing.trace import (
-    MIDDLE,
-    ROTATED_GRID,
-    SOLID_LIGHTS,
-    SPHERE_LIGHTS,
-    Eye,
-    effort_of,
-    find_contrast,
-    illuminate_kernel,
-    in_tiles,
-    trace_kernel,
-)
 from cortado.scene.appearance import View
 from cortado.scene.scene import Scene
 
@@ -217,7 +206,7 @@ def environment_of(stage: Stage) -> Any:
     """Return the `Environment` of a stage, without solids and without shadows."""
     picture, light, s = stage.picture, stage.picture.sun_and_sky, Environment()
     horizon = np.asarray(light.background)
-    s.size, s.nearest, s.segments = stage.size, 1e-4 * stage.size, effort_of(stage.picture).segments
+    s.size, s.nearest, s.segments = stage.size, 1e-4 * stage.size, trace.effort_of(stage.picture).segments
     s.sun, s.fill = wp.vec3(*stage.sun), wp.vec3(*stage.fill)
     s.horizon, s.zenith = wp.vec3(*horizon), wp.vec3(*(horizon * light.zenith))
     s.lamp, s.strip, s.sunlight = wp.vec3(*light.lamp), wp.vec3(*light.strip), wp.vec3(*light.sunlight)
@@ -262,15 +251,20 @@ class SpacePainter:
         self.stage, self.device = stage, wp.get_device(device)
         self._launch = BandLauncher(self.device)
         self._solids = SolidSurfaces(stage, self.device)
-        self._trace, self._illuminates = trace_kernel(*self._solids.kinds), illuminate_kernel(*self._solids.kinds)
+        self._trace, self._illuminates = (
+            trace.trace_kernel(*self._solids.kinds),
+            trace.illuminate_kernel(*self._solids.kinds),
+        )
         shading = self._trace, self._illuminates
-        self._kernels = *shading, find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
+        self._kernels = *shading, trace.find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
         """Kernels of a picture, listed so that their modules compile in parallel."""
-        self._effort, is_liquid = effort_of(stage.picture), stage.picture.surface == "liquid"
-        self._lamps = self._rays_to_light(*(self._effort.lights if is_liquid else SPHERE_LIGHTS))
-        self._lamps_of_solids = self._rays_to_light(*SOLID_LIGHTS)
-        self._pixels = wp.array(in_tiles(stage.picture.width, stage.picture.height), dtype=wp.int32, device=device)
-        offsets = MIDDLE, ROTATED_GRID[: self._effort.again]
+        self._effort, is_liquid = trace.effort_of(stage.picture), stage.picture.surface == "liquid"
+        self._lamps = self._rays_to_light(*(self._effort.lights if is_liquid else trace.SPHERE_LIGHTS))
+        self._lamps_of_solids = self._rays_to_light(*trace.SOLID_LIGHTS)
+        self._pixels = wp.array(
+            trace.in_tiles(stage.picture.width, stage.picture.height), dtype=wp.int32, device=device
+        )
+        offsets = trace.MIDDLE, trace.ROTATED_GRID[: self._effort.again]
         self._offsets = [wp.array(one, dtype=wp.vec2, device=device) for one in offsets]
 
     def image(self, *state: Any) -> Points:
@@ -342,7 +336,7 @@ class SpacePainter:
         self._launch(self._trace, len(self._pixels), **given, pixels=self._pixels, offsets=once)
         rough = wp.empty(len(image), dtype=wp.int32, device=self.device)
         how = {"columns": picture.width, "contrast": self._effort.contrast}
-        self._launch(find_contrast, len(image), image=image, **how, found=rough)
+        self._launch(trace.find_contrast, len(image), image=image, **how, found=rough)
         pixels, _ = marked(rough, self._launch)
         self._launch(self._trace, len(pixels), **given, pixels=pixels, offsets=again)
         found: Points = image.numpy().reshape(picture.height, picture.width, 3)
@@ -371,7 +365,7 @@ def _directions(count: int) -> Points:
 
 
 def _eye(stage: Stage) -> Any:
-    picture, eye = stage.picture, Eye()
+    picture, eye = stage.picture, trace.Eye()
     forward = stage.look_at - stage.eye
     forward = forward / np.linalg.norm(forward)
     right, up = screen_axes(forward)
