@@ -233,7 +233,7 @@ def quick(monkeypatch):
         return datasets.OneRun(arrays, {"vel": moments, "acc": moments, **ends})
 
     made.asked = []
-    monkeypatch.setattr(command, "one_run", made)
+    monkeypatch.setattr("cortado.optimisation.datasets.one_run", made)
     monkeypatch.setattr(command, "Simulation", lambda *_: None)
     made.others = others
     return made
@@ -337,7 +337,7 @@ def test_a_data_set_that_grows_is_the_one_made_at_once_and_keeps_its_runs(file, 
             raise DivergedError(3, 7, "take a smaller time step")
         return whole(simulation, sample)
 
-    monkeypatch.setattr(command, "one_run", made)
+    monkeypatch.setattr("cortado.optimisation.datasets.one_run", made)
     assert cortado_command(*again, "--runs", 5, "--out", "grown")[0] == 0
     before = content_of("grown")
     asked.clear()
