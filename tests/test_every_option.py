@@ -38,9 +38,9 @@ COMMANDS = {
         "scheduler tcp://127.0.0.1:1",
     ),
     "picture": (
-        "run --set picture.width=128 --set picture.height=72 --set picture.film_frames=3",
-        "frame 0, film --out film.webp, lines 90, camera orbit, colour speed, out b.png, set picture.width=100, "
-        "device cuda:99",
+        "run --set picture.width=128 --set picture.height=72",
+        "frame 0, film --out film.webp --set picture.film_frames=3, lines 90, camera orbit, colour speed, out b.png, "
+        "set picture.width=100, device cuda:99",
     ),
     "export": ("run --to vtp", "to ply, out there, every 2, set picture.colour=speed"),
     "convergence": ("run finer finest", "quantity absent.py:f, json"),
@@ -193,7 +193,7 @@ BASES: dict[str, dict[str, Any]] = {
         "dataset": {
             **{"steps": 4, "write_every": 2, "vary": {"phase.0.viscosity": [0.05, 0.1]}, "seed": 3},
             **{"logarithmic": ["phase.0.viscosity"], "position_noise": 0.01, "velocity_noise": 0.01},
-            **{"valid": 0.16, "test": 0.16, "walls": True, "tangents": 1, "tangent_frames": "all"},
+            **{"valid": 0.16, "test": 0.25, "walls": True, "tangents": 1, "tangent_frames": "all"},
         }
     },
 }
