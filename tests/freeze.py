@@ -63,8 +63,10 @@ FLOOR = 1e-2
 """The norm of a gradient counts as this part of the greatest one of its row at least: some are mostly round-off."""
 GROWING = {"baffles", "beach", "drop", "drop_large", "ink", "jug", "match_image", "materials", "pour", "rotor"}
 GROWING |= {f"new {name}" for name in ("drop", "pillar", "pour", "raft", "rayleigh_taylor", "shaken", "stirred")}
-GROWING |= {"new baffled_tank"}
-"""Scenes in which a last bit of NumPy's grows beyond that, as splashes do: they have their numbers on one machine."""
+GROWING |= {"new baffled_tank", "dam_break_large", "shaken"}
+GROWING |= {f"{name} float32" for name in ("dam_break", "dam_break_dataset", "two_dams")}
+"""Scenes, or rows of a precision, in which a last bit of NumPy's grows beyond that, as splashes do: they have their
+numbers on one machine."""
 MODULES = ("errors", "environments", "jax", "torch")
 """Public ones besides those among the names of `cortado`."""
 SPACINGS = {
