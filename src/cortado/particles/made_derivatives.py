@@ -1,16 +1,14 @@
-"""Derivatives of sums over neighbours that Warp makes by automatic differentiation (`cortado.particles.pair_sums`).
+"""Makes derivatives of sums over neighbours (`cortado.particles.pair_sums`) by Warp's automatic differentiation.
 
-The sum over neighbours j of particle i is S_i = sum_j T_ij. The term T_ij depends on the separation x_ij, on values c_i
-and c_j of both particles, and on parameters. Let S_i^ be the adjoint of S_i, and <a, b> the scalar product. The
-adjoints of the position and of the value of particle i are
+The sum S_i = sum_j T_ij of particle i adds a term T_ij for each neighbour j. The term T_ij depends on the separation
+x_ij, on values c_i and c_j of both particles, and on parameters. Let S_i^ be the adjoint of the sum, and <a, b> the
+scalar product. The position and the value of particle i have the adjoints
 
     x_i^ = sum_j d<T_ij, S_i^> / dx_ij - d<T_ji, S_j^> / dx_ji
     c_i^ = sum_j d<T_ij, S_i^> / dc_i + d<T_ji, S_j^> / dc_i
 
-These derivatives are exact, but slower than handwritten derivatives.
-
-Call such a derivative only from a Warp kernel. If a `wp.func` calls the derivative, the generated C++ code does not
-compile.
+Such derivatives are exact, but slower than handwritten derivatives. Only a Warp kernel may call a made derivative: if a
+`wp.func` calls the derivative, the generated C++ code does not compile.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -29,24 +29,23 @@ from cortado.particles.state import Layout, zeros
 @dataclass(frozen=True)
 class WallArrays(Rows):
     positions: np.ndarray
-    """Positions (b, 3) [m]. Positions on moving solids are in the frame of the solid."""
+    """Array of shape (b, 3) with positions [m]. Positions on moving solids are in the frame of the solid."""
     weights: np.ndarray
-    """Weights (b,) of wall particles in the density [-]. The weight of a fluid particle is 1."""
+    """Array of shape (b,) with the weights of wall particles in the density [-]. A fluid particle has 1."""
     grips: np.ndarray
-    """Weights (b,) of wall particles in sums of friction [-]. The weight is 0 for walls with free slip."""
+    """Array of shape (b,) with the weights of wall particles in sums of friction [-]. Walls with free slip have 0."""
     feet: np.ndarray
-    """Vectors (b, 3) from wall particles to the nearest point on the surface [m]."""
+    """Array of shape (b, 3) with vectors from wall particles to the nearest point on the surface [m]."""
     slides: np.ndarray
-    """Velocities with which the surface slides along the solid (b, 3) [m/s]."""
+    """Array of shape (b, 3) with the velocities at which the surface slides along the solid [m/s]."""
     solid: np.ndarray
-    """Number (b,) of the solid: 0, 1, ... for moving solids, -2, -3, ... for solids at rest, and -1 for the
-    container."""
+    """Array of shape (b,) with numbers of solids: from 0 up if moving, from -2 down at rest, -1 for the container."""
     faces: np.ndarray
-    """Number (b,) of the flat face that mirrors the fluid in front of the wall particle, or -1."""
+    """Array of shape (b,) with the number of the flat face that mirrors fluid before a wall particle, or -1."""
 
 
 def pose_arrays(members: int, solids: int, precision: Precision, device: Any) -> dict[str, wp.array]:
-    """Make arrays (members, solids) for the poses of solids before and after a time step, by kernel argument name."""
+    """Make arrays (members, solids) for the poses of solids before and after a time step, by kernel argument."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     kinds = {"before": vector, "turns_before": matrix, "after": vector, "turns": matrix}
     kinds |= dict.fromkeys(("before_dot", "turned_before_dot", "after_dot", "turned_dot"), vector)
@@ -206,7 +205,7 @@ class MovingWalls:
         self.grid.starts = wp.zeros_like(self._sort.grid.starts)
 
     def write(self, time_step: wp.array, walls: Mapping[str, wp.array]) -> None:
-        """Write the wall particles to the arrays of a neighbour search, for a ``time_step`` (members,) [s]."""
+        """Write the wall particles to the arrays of a neighbour search. Each scene has its own ``time_step`` [s]."""
         launch(self._kernels.place, self._all, self._device, self._own, self.named)
         self._sort(self._own["x"])
         starts, shifted = self._sort.grid.starts, self.grid.starts

@@ -324,7 +324,7 @@ class NeighbourSearch:
         self.order = self._sort.order
         names = "fluid_count", "filling", "count", "all_count"
         self.lists = {name: wp.zeros(particles, dtype=wp.int32, device=device) for name in names}
-        """Lengths of the lists (n,), by kernel argument name."""
+        """Arrays of shape (n,) with the lengths of the lists, by kernel argument."""
         self.fluid_count, self.filling, self.count, self.all_count = self.lists.values()
         self._launch = KernelLauncher(particles, device, record_tape=False)
         self._needed = wp.zeros(MOST_PARTS, dtype=wp.int32, device=device)
@@ -358,7 +358,7 @@ class NeighbourSearch:
             self.neighbours = wp.empty(shape[::-1], dtype=wp.int32, device=self.device)
 
     def sort(self, positions: wp.array) -> None:
-        """Sort positions (members * n,) [m] by cell, and write the order to ``order``. The sort is stable."""
+        """Sort ``positions`` [m] by cell, and write the order of the particles to ``order``. The sort is stable."""
         walls, self._unsorted_walls = self._unsorted_walls, None
         if walls is not None:  # once, and not before kernels are compiled side by side
             dtype = self.walls["wall_positions"].dtype
@@ -378,8 +378,8 @@ class NeighbourSearch:
                 wp.copy(array, wp.array(values, dtype=array.dtype, device=self.device), count=len(values))
 
     def fill(self, neighbourhood: Any, positions: wp.array, bad_step: wp.array) -> None:
-        """List the neighbours of sorted positions (members * n,) [m]. Scenes whose ``bad_step`` (members,) is not -1
-        get empty lists. Lists are incomplete if `needed` exceeds the capacity."""
+        """List the neighbours of sorted positions ``x`` [m]. Scenes whose ``bad_step`` (members,) is not -1 get empty
+        lists. Lists are incomplete if `needed` exceeds the capacity."""
         given = {"s": neighbourhood, "bad_step": bad_step, "x": positions, "needed": self._needed}
         grids = {"grid": self._sort.grid, "wall_grid": self._wall_sort.grid, "near_walls": self._near_walls}
         moving = self._wall_sort.grid if self.moving is None else self.moving.grid

@@ -99,7 +99,7 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return a view of an array of scalars, vectors or matrices as an array of scalars with the given shape."""
+    """Return a view of the array as scalars with the given shape. Elements may be scalars, vectors or matrices."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -169,7 +169,7 @@ class State(Arrays):
     """The arrays of a state by field name, or their tangents or adjoints.
 
     Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) with
-    one number for each phase [-]. Particles are in the order of the scene. In a batch the scenes are concatenated.
+    one number for each phase [-]. Particles are in the order of the scene. A batch has one scene after the other.
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):

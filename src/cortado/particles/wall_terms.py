@@ -210,7 +210,7 @@ class SolidShares:
         return self._arrays[solid]
 
     def collect(self, solid: int) -> dict[str, wp.array]:
-        """Return the adjoints of the pose and the scale of a solid (members,), and reset the contributions to 0."""
+        """Return adjoints (members,) of a solid's pose and scale, and reset the contributions to 0."""
         sums = zip(self._sums[solid], self._arrays[solid].values(), strict=True)
         found = dict(zip(BARS, (total(array) for total, array in sums), strict=True))
         for bar, given in self._whole[solid].items():

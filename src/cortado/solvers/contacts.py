@@ -214,12 +214,12 @@ class Touching:
     against: int
     """Index of the touched solid among the moving solids; -1 for solids at rest."""
     other: int
-    """Index of the touched solid among the free bodies; -1 if it is not a free body."""
+    """Index of the touched solid among the free bodies; -1 for a solid that is not a free body."""
     obstacles: Sequence[Obstacle]
     points: Points
-    """Points of the body's surface, in the frame of the body (n, d) [m]."""
+    """Array of shape (n, d) with points of the body's surface in the body's frame [m]."""
     slides: Sequence[float] = ()
-    """Velocity of the touched solid's sliding surface, in the solid's frame (d,) [m/s]."""
+    """Vector of shape (d,): velocity of the touched solid's sliding surface in the solid's frame [m/s]."""
 
 
 class Contact:

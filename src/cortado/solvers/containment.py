@@ -22,7 +22,7 @@ from cortado.particles.state import Layout, State, padded
 from cortado.solvers.obstacles import FURTHEST, Obstacle, Walled, middle_of, obstacle_mesh
 
 NO_PARTICLE = 2**31 - 1
-"""Index that stands for no lost particle."""
+"""Particle number of a scene without lost particles."""
 
 
 @cache
@@ -168,7 +168,7 @@ REACH = 4.0
 """Greatest distance from a surface at which particles are tested [spacings]."""
 
 Distance = Callable[[Points], Points]
-"""Function from points (n, d) to signed distances from a wall (n,) [m], positive outside."""
+"""Function that maps points (n, d) to signed distances from a wall [m], which are positive outside the wall."""
 
 
 @dataclass(frozen=True)
@@ -210,9 +210,9 @@ class Containment:
         self._constants: dict[str, Any] = {"particles": layout.particles, "first_waiting": first_waiting}
         self._constants |= {"bounds": bounds, "solids": solids}
         self.bad_step = wp.full(members, -1, dtype=wp.int32, device=device)
-        """First step with a lost particle in each scene, or -1 (members,)."""
+        """Array of shape (members,) with the first step in which each scene lost a particle, or -1."""
         self.bad_particle = wp.full(members, NO_PARTICLE, dtype=wp.int32, device=device)
-        """First lost particle of each scene, or `NO_PARTICLE` (members,)."""
+        """Array of shape (members,) with the first lost particle of each scene, or `NO_PARTICLE`."""
         self._count = wp.zeros(members, dtype=wp.int32, device=device)
         self.bad_step_copy = HostCopy(self.bad_step)
 
@@ -246,7 +246,7 @@ class Containment:
         return self._precision.furthest * self.walled.spacing < distance < np.inf
 
     def where(self, position: np.ndarray) -> str:
-        """Describe where a lost particle at ``position`` (d,) [m] is."""
+        """Describe where the lost particle at ``position`` [m] is."""
         place = f"({', '.join(f'{x:g}' for x in position)}) m"
         if not np.isfinite(position).all():
             return "has no finite position"
@@ -290,7 +290,7 @@ STEP = 1e-3
 
 
 def shut_in(containment: Containment, member: int, points: Points) -> str | None:
-    """Return a sentence about two walls with too narrow a gap at the points (n, d) [m], or None."""
+    """Describe two walls with too narrow a gap at ``points`` [m], or return None."""
     spacing = containment.walled.spacing
     best, found = NARROW * spacing, None
     near = [(name, one, d) for name, one in containment.walls(member) if ((d := one(points)) < best).any()]

@@ -98,7 +98,7 @@ class IterativeSolve(Protocol):
     name: str
     """Name of the iterations in the diagnostics of a run."""
     count: wp.array
-    """Number of iterations of the last solve in each scene (members,)."""
+    """Array of shape (members,) with the number of iterations in each scene's last solve."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class LoopLimits:
     tolerance: float
     """Upper bound on the average or root mean square error."""
     greatest_tolerance: float
-    """Upper bound on the error of every particle; may be infinite."""
+    """Upper bound on the error of every particle. The bound may be infinite."""
 
 
 class StepRecord:
@@ -118,7 +118,7 @@ class StepRecord:
         """Diagnostics contain the iterations under ``name``, and the errors under ``columns``."""
         shape, kinds = (max(steps, 1), layout.members), (wp.int32, layout.precision.pair)
         self.arrays = [wp.zeros(shape, dtype=kind, device=layout.device) for kind in kinds[: 2 if columns else 1]]
-        """Numbers of iterations and errors on the device (steps, members). The errors exist only with ``columns``."""
+        """Device arrays of shape (steps, members): numbers of iterations, and with ``columns`` also errors."""
         self.copies, self._batch = [HostCopy(array) for array in self.arrays], layout.batch
         self._name, self._columns = name, columns
         self.read(0)
@@ -130,7 +130,7 @@ class StepRecord:
 
     @property
     def diagnostics(self) -> dict[str, NDArray]:
-        """Return the diagnostics of the last run by name (steps,), in a batch (steps, batch)."""
+        """Return the last run's diagnostics by name, as arrays of shape (steps,), or (steps, batch) for a batch."""
         if self._diagnostics is None:
             found = [copy.read(self._steps) for copy in self.copies]
             iterations, *errors = [array[:, 0] for array in found] if self._batch is None else found
@@ -140,7 +140,7 @@ class StepRecord:
 
     @property
     def counts(self) -> NDArray:
-        """Return the number of iterations of each step (steps,), in a batch the greatest over all scenes."""
+        """Return an array (steps,) with each step's iterations, in a batch the greatest number over all scenes."""
         return self.copies[0].read(self._steps).max(axis=1)
 
     def bounds(self, limits: Mapping[str, float]) -> list[NDArray]:
@@ -211,24 +211,24 @@ class Loop:
         errors_name: str = "density_errors",
         weighted: bool = False,
     ):
-        """With ``limits`` None the loop has no iterations. If ``weighted`` is true, the errors of all particles are
-        reduced to a weighted root mean square, else to average and maximum."""
+        """With ``limits`` None the loop has no iterations. The errors of all particles are reduced to average and
+        maximum, or to a weighted root mean square if ``weighted`` is true."""
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [errors_name] if weighted else [errors_name, f"greatest_{errors_name}"]
         """Names of the reduced errors in diagnostics."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
-        """Two error values of each particle in the last iteration (n,)."""
+        """Array of shape (n,) with two error values of each particle in the last iteration."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
-        """Number of iterations of each scene (members,), or `UNKNOWN` while the loop runs. Later iterations must not
-        change a scene that has ended."""
+        """Array of shape (members,) with each scene's number of iterations, or `UNKNOWN` while the loop runs. Later
+        iterations must not change a scene that has ended."""
         self._launch, self._kernels = launch, convergence_kernels(precision, weighted)
         size = layout.particles, precision, device, layout.members
         self._sum = layout.sum_of(precision.pair) if weighted else sum_and_maximum(*size)
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
-        """Fixed number of iterations, or 0."""
+        """Number of iterations if the number is fixed, otherwise 0."""
         self.bounds: dict[str, float] = {}
         """Bounds on the reduced errors, by name. With a fixed number of iterations the dict is empty."""
         if limits is not None and not is_fixed:
@@ -250,7 +250,7 @@ class Loop:
         return int(record.counts[step])
 
     def run(self, iterate: Callable[[int], None]) -> None:
-        """Iterate until the errors are small enough. ``iterate`` is called with the number of the iteration, from 0.
+        """Iterate until the errors are small enough. The loop calls ``iterate`` with the iteration's number, from 0.
 
         After the minimum number of iterations, a CUDA graph repeats the call ``iterate(maximum_iterations)``.
         """

@@ -48,12 +48,12 @@ class NamedSolid:
     number: int
     """Number of the solid from `cortado.scene.motions.wall_numbers`."""
     middle: NDArray
-    """Initial position of the solid's middle (3,) [m]."""
+    """Vector of shape (3,) to the solid's middle at the start [m]."""
 
 
 @dataclass(frozen=True)
 class Walled:
-    """The region for particles: the container and the solids."""
+    """The region where particles may be, inside the container and outside the solids."""
 
     region: Region
     """Region inside the container, unbounded along periodic axes. Without pressure the region is the whole space."""
@@ -63,7 +63,7 @@ class Walled:
     moving: tuple[Obstacle, ...]
     """Moving solids. The origin of each solid's frame is the middle of the solid."""
     periods: Points
-    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
+    """Vector of shape (d,) with the lengths of the periodic box [m], 0 along an axis that is not periodic."""
 
     @property
     def dimension(self) -> int:
@@ -123,16 +123,17 @@ class FlatFaces:
     """Flat faces of moving solids that mirror the fluid."""
 
     solids: Numbers
-    """Number of the solid of each face (f,)."""
+    """Array of shape (f,) with the number of each face's solid."""
     places: Points
-    """Middles of faces in the solids' frames (f, 3) [m]."""
+    """Array of shape (f, 3) with each face's middle in the frame of its solid [m]."""
     frames: Points
     """Matrices (f, 3, 3) with rows of unit vectors: the normal towards the fluid, and two vectors along the face."""
     sizes: Points
-    """Half lengths of faces along the rows of `frames` (f, 3) [m]; 0 along the normal."""
+    """Array of shape (f, 3) with half of each face's lengths along the vectors in `frames` [m], 0 along the normal."""
 
     def behind(self, solid: Numbers, positions: Points, feet: Points, near: float) -> Numbers:
-        """Return the number of the face above each wall particle (b,), or -1. ``near`` [m] is a tolerance."""
+        """Return an array (b,) with the number of the face above each wall particle, or -1. ``near`` [m] is a
+        tolerance."""
         found = np.full(len(solid), -1)
         for number, (place, frame, size) in enumerate(zip(self.places, self.frames, self.sizes, strict=True)):
             at, foot = (positions + feet - place) @ frame.T, feet @ frame.T

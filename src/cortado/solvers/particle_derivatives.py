@@ -1,4 +1,4 @@
-"""Tangent and adjoint of the base class of particle solvers."""
+"""The tangent and the adjoint of a particle solver's step, without its pressure iterations."""
 
 from functools import partial
 from weakref import finalize

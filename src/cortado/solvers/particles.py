@@ -62,7 +62,7 @@ class ParticleSolver(Staying):
     carried_fields: tuple[StateField, ...] = ()
     """Fields of particles that the solver needs in the next step."""
     topic = "density"
-    """Part of the names of Warp modules."""
+    """Word in the names of the solver's Warp modules."""
     density_power = 2
     """The pressure force divides the pressure by this power of the number density."""
     shares: tuple[str, ...] = ()
@@ -115,7 +115,7 @@ class ParticleSolver(Staying):
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return the velocity change by the last step's pressure, its tangent or adjoint; None if not stored."""
+        """Return the velocity changes in ``carried`` by the last step's pressure, or None if none are stored."""
         return None
 
     def vectors(self) -> wp.array:
@@ -175,7 +175,7 @@ class ParticleSolver(Staying):
             wp.copy(own.rounds, given.rounds)
 
     def reserve(self, counts: Counts) -> None:
-        """Do nothing: without iterations no arrays are needed."""
+        """Do nothing, because a solver without iterations needs no further arrays."""
 
     def reset(self, step: int = 0) -> None:
         for loop in self.loops:
@@ -214,7 +214,7 @@ class ParticleSolver(Staying):
         return context
 
     def accelerate(self, context: StepContext) -> wp.array:
-        """Return the accelerations of sorted particles by all explicit forces (n,) [m / s2]."""
+        """Return an array of shape (n,) with the sum of all explicit accelerations of sorted particles [m / s2]."""
         for t, force in enumerate(self.forces):
             force.accelerate(context, self.accelerations[t], self.accelerations[t + 1])
         return self.accelerations[-1]
@@ -246,8 +246,8 @@ class ParticleSolver(Staying):
             self.launch(kernels.count_step, bad, step=self.step_number, **each)
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
-        """Return the densities (n,) [kg / m3] in scene order, for a batch one scene after the other. Moving solids are
-        at their poses at the end of step ``step``. The call overwrites the arrays of the solver."""
+        """Return an array of shape (n,) with densities [kg / m3] in scene order, for a batch one scene after the other.
+        Moving solids are at their poses at the end of step ``step``. The call overwrites the arrays of the solver."""
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():
@@ -257,11 +257,11 @@ class ParticleSolver(Staying):
         return found
 
     def pressures(self) -> wp.array | None:
-        """Return the pressure (n,) [Pa] on walls of each sorted particle in the last step; None without pressure."""
+        """Return an array (n,) with sorted particles' pressures on walls [Pa], or None without pressure."""
         return None
 
     def stresses(self) -> wp.array | None:
-        """Return the pressures (n,) [Pa] of sorted particles for pressure sensors."""
+        """Return an array of shape (n,) with sorted particles' pressures for pressure sensors [Pa]."""
         return self.pressures()
 
     # ---- derivatives ---------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ class StepLog(Protocol):
 
     @property
     def diagnostics(self) -> Mapping[str, NDArray]:
-        """Return the diagnostics of the steps up to the last `read`, by name: (steps,), or (steps, batch) for a batch.
+        """Return arrays (steps,) of diagnostics by name up to the last `read`; a batch has arrays (steps, batch).
 
         Every solver has ``converged``. PCISPH also has ``iterations``, ``density_errors`` and
         ``greatest_density_errors``. The two errors are the mean and the maximum of the particles' relative compression.
@@ -36,29 +36,29 @@ class StepLog(Protocol):
 
     @property
     def copies(self) -> Sequence[HostCopy]:
-        """Return the copies on the host of the log's arrays."""
+        """Return the host copies of the log's arrays."""
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
         """Test if all loops converged in all steps up to the last `read`, without diagnostics above ``limits``."""
 
     def read(self, steps: int) -> None:
-        """Set the number of steps of the last run to ``steps``. The diagnostics of these steps are read from the device
+        """Set ``steps`` as the number of steps in the last run. The diagnostics of these steps are read from the device
         when needed."""
 
     def assign(self, other: Self) -> None:
         """Copy the diagnostics from a log of the same solver and length."""
 
     def seek(self, step: int) -> Counts:
-        """Return the numbers of iterations of step ``step``, and prepare the solver's loops to repeat the step. For a
-        batch, return the greatest numbers over all scenes."""
+        """Return how often each loop iterated in step ``step``, and prepare the loops to repeat the step. For a batch,
+        each number is the greatest over all scenes."""
 
 
 class StepTangent(Protocol):
     """Protocol of the tangent of a repeated step (forward mode).
 
     A solver with pressures also has the `Tangents` ``dot``, and the methods ``pressures(rounds)`` and
-    ``stresses(rounds)``. They return the tangents (n,) of the pressures of sorted particles [Pa], on walls and for
-    pressure sensors. ``rounds`` are the numbers of pressure iterations of the scenes.
+    ``stresses(rounds)``. The methods return tangents of pressures on walls and for pressure sensors [Pa], for sorted
+    particles (n,). The list ``rounds`` has each scene's pressure iterations.
     """
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:
@@ -68,8 +68,8 @@ class StepTangent(Protocol):
 class StepAdjoint(Protocol):
     """Protocol of the adjoint of a repeated step (reverse mode).
 
-    A solver with pressures also has the method ``from_within(counts, within, state_bar, parameters)``. It writes to
-    ``state_bar`` the adjoint of the state before the repeated step, given the adjoints `WithinBar` within the step.
+    A solver with pressures also has the method ``from_within(counts, within, state_bar, parameters)``. The method
+    writes the adjoint of the state before the step to ``state_bar``, given the adjoints ``within`` the step.
     """
 
     def begin(self) -> None:
@@ -88,11 +88,11 @@ class WithinBar:
 
     fields: Fields
     p: wp.array
-    """Adjoint of the pressures of particles on walls (n,)."""
+    """Array of shape (n,) with the adjoints of pressures on walls."""
     stress: wp.array | None
-    """Adjoint of the pressures for pressure sensors (n,), or None."""
+    """Array of shape (n,) with the adjoints of pressures for pressure sensors, or None."""
     v_star: wp.array
-    """Adjoint of the velocities after explicit forces (n,)."""
+    """Array of shape (n,) with the adjoints of velocities after explicit forces."""
 
 
 class Solver(Protocol):
@@ -110,7 +110,7 @@ class Solver(Protocol):
     turn: Turn
     containment: Containment
     step_number: wp.array
-    """Number of the next step in each scene (members,)."""
+    """Array of shape (members,) with the number of each scene's next step."""
     generation: int
     """Number of times that arrays or launches were replaced. A replacement makes captured CUDA graphs invalid."""
 
@@ -131,7 +131,7 @@ class Solver(Protocol):
 
     @property
     def copies(self) -> Sequence[HostCopy]:
-        """Return the copies on the host of the arrays that `make_room` and the search for lost particles read."""
+        """Return host copies of the arrays that `make_room` and the search for lost particles read."""
 
     def make_room(self) -> bool:
         """Lengthen neighbour lists that were too short. Return True if steps must be repeated for this reason."""
@@ -140,13 +140,13 @@ class Solver(Protocol):
         """Take one step, and record the step in ``log``. ``state`` and ``new_state`` may be the same object."""
 
     def reserve(self, counts: Counts) -> None:
-        """Allocate arrays for the intermediate values of a step with these numbers of iterations."""
+        """Allocate arrays for the intermediate values of a step with ``counts`` iterations."""
 
     def replay(self, state: State, parameters: Parameters, counts: Counts) -> None:
         """Repeat a step exactly (bit for bit), and store every intermediate value."""
 
     def write_state(self, counts: Counts, parameters: Parameters, new_state: State) -> None:
-        """Write the result of the repeated step."""
+        """Write the result of the repeated step to ``new_state``."""
 
     def context(self, parameters: Parameters) -> StepContext:
         """Return the context of the current step."""

@@ -1,20 +1,10 @@
-"""Surface tension by curvature, as a force across the surface (continuum surface force, Brackbill et al. 1992). Normals
-are smoothed, and the curvature is corrected (Morris 2000; Zorilla et al. 2020).
+"""Surface tension by curvature, as a continuum surface force. `docs/discretisation.md` has the equations.
 
-Let g_ij = V grad W_ij, with the volume V of a particle. S(a, b) is a smoothstep from a to b, and s the spacing. With
-sums over the fluid, including the particle itself, the force follows from
-
-    g_i = sum_j g_ij,   z_i = V sum_j W_ij,   q_i = V sum_j W_ij g_j / z_i,
-    w_i = S(0.03, 0.1) of s |q_i|,   e_i = q_i / |q_i|,
-    B_i = -sum_j w_j g_ij x_ij^T,   D_i = sum_j w_j (e_j - e_i) g_ij^T,   kappa_i = -tr(B_i^-1 D_i),
-    a_i = V sum_j W_ij w_j kappa_j,   b_i = V sum_j W_ij w_j,
-    k_i = (a_i / b_i) / (1 + delta a_i / b_i),   m_i times the acceleration = (sigma / J) k_i w_i q_i.
-
-The vector g is the gradient of the fluid's colour, and its average q (Shepard 1968) points into the fluid. The weight w
-is 1 at the surface and 0 inside; e is the normal. D B^-1 is the gradient of normals, and is exact if normals vary
-linearly (Bonet and Lok 1999). The trace kappa needs only the symmetric part of D. The force acts at a mean depth delta
-below the surface, where the curvature 1 / R of the surface becomes 1 / (R - delta). J is the sum of w |q| over the
-layers of a flat surface, averaged over an axis-parallel and a diagonal cut of the lattice.
+The vector g is the gradient of the fluid's colour, and the average q of g (Shepard 1968) points into the fluid. The
+weight w is 1 at the surface and 0 inside the fluid. The gradient D B^-1 of normals is exact if normals vary linearly
+(Bonet and Lok 1999). The curvature needs only the symmetric part of the matrix D. The force acts at a mean depth delta
+below the surface, where the curvature 1 / R of the surface becomes 1 / (R - delta). The constant J is the sum of w |q|
+over the layers of a flat surface, averaged over an axis-parallel and a diagonal cut of the lattice.
 
 The constants in delta, in spacings, were fitted to discs and balls of concentric rings and shells. The fitted values
 hold within 0.05 for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth
@@ -22,9 +12,9 @@ hold within 0.05 for every kernel with a support of at least 2.5 spacings. The c
 be (d - 1) sigma / R.
 
 A surface wave has a smaller amplitude at the depth `ACTS`, where the force acts. The squared frequency of mode n would
-therefore be too small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. Subtracting ACTS d / (3 (d - 1)) from delta
-makes the errors of pressure and of the squared frequency of mode 2 equal and opposite: 0.5 / R in 2-D and 0.75 / R in
-3-D.
+therefore be too small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. The depth delta is smaller by ACTS d / (3 (d -
+1)) for this reason. The errors of pressure and of the squared frequency of mode 2 are then equal and opposite: 0.5 / R
+in 2-D and 0.75 / R in 3-D.
 """
 
 from dataclasses import dataclass

@@ -1,14 +1,8 @@
 """Density by summation over fluid and wall particles (Solenthaler and Pajarola 2008).
 
-The number density of particle i is
-
-    n_i = V (W(0) + sum_j W_ij + sum_b w_b W_ib)
-
-with the rest volume V of a particle, the smoothing kernel W, neighbours j, and wall particles b of weight w_b. The
-density is m_i n_i, where m_i is the mass of the particle divided by V. Masses of neighbours do not enter, so that the
-density of a heavy fluid does not smear into a light fluid.
-
-The pressure of a particle pushes walls along the sum of the walls' kernel gradients.
+`docs/discretisation.md` has the equation of the number density. The density is the number density times the mass of the
+particle divided by its rest volume. Masses of neighbours do not enter the sum, so that the density of a heavy fluid
+does not smear into a light fluid. The pressure of a particle pushes walls along the sum of the walls' kernel gradients.
 """
 
 from functools import cache, cached_property, partial
@@ -157,10 +151,10 @@ class WallAction(Protocol):
     number of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
-        """Return vectors (n,) for sorted particles. The action of a force consists of accelerations [m/s2]."""
+        """Return an array (n,) of one vector for each sorted particle. A force's vectors are accelerations [m/s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        """Return the tangents of the action (n,). Forward mode of the step must be complete."""
+        """Return an array of shape (n,) with the tangents of the action. Forward mode of the step must be complete."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
         """Convert the adjoint ``total_bar`` of the action to adjoints of sorted particles, parameters and solids in

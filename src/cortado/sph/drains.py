@@ -1,22 +1,23 @@
 """Drains, which remove particles that enter them, and sinks, to which fluid flows at a given flow rate.
 
-A particle inside a drain at the start of a step is removed. At the end of the step, a removed particle is put at a
-resting position far from all others. The particle's field ``drained`` is then the number of the drain. The removal has
-no derivative.
+A drain removes each particle that is inside the drain at the start of a step. At the end of the step, a removed
+particle is put at a resting position far from all others. The particle's field ``drained`` is then the number of the
+drain. The removal has no derivative.
 
-A sink makes fluid flow to its middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions. The velocity after
-explicit forces, with the acceleration a, is
+A sink makes fluid flow to the sink's middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions. The velocity
+after explicit forces, with the acceleration a, is
 
     v* = (1 - phi) (v + dt a) + phi (u - lambda w),   u = -Q y / (S r^d),
 
-instead of v + dt a. S is the part of the unit sphere or circle that walls leave open. The weight phi of the prescribed
-flow u rises smoothly from 0 at the radius r_2 to 1 at the radius r_1. Particles within r_0 < r_1 are removed, so that a
-removed particle has neighbours with prescribed motion. The term with lambda < 1 damps w, the velocity change by
-pressure in the previous step. Without this term, pressure would press fluid through the shell from r_0 to r_1.
+instead of v + dt a. The constant S is the part of the unit sphere or circle that walls leave open. The weight phi of
+the prescribed flow u rises smoothly from 0 at the radius r_2 to 1 at the radius r_1. Particles within r_0 < r_1 are
+removed, so that a removed particle has neighbours with prescribed motion. The term with lambda < 1 damps w, the
+velocity change by pressure in the previous step. Without this term, pressure would press fluid through the shell from
+r_0 to r_1.
 
-Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. M is the number of particles within
-r_1. E is the rounded number of particles that the sink should have removed but has not, from -M / 4 to M / 4. E has no
-derivative.
+Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. The number M counts the particles
+within r_1. The number E, from -M / 4 to M / 4 and without derivative, counts particles that the sink should have
+removed but has not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,7 +46,7 @@ MEMORY = 0.98
 BOX, PLANE, BALL = 0, 1, 2
 MOST = 0.25
 DRAINED = StateField("drained", "", Entry.NUMBER)
-"""Number, from 1, of the drain that removed a particle; 0 for all other particles."""
+"""Field with the number, from 1, of the drain that removed a particle, and with 0 for all other particles."""
 
 
 def behind(name: str) -> StateField:
@@ -59,7 +60,7 @@ class Mouth:
     shape: int
     middle: Points
     ends: Points
-    """Corners of the box relative to the middle of the box (2, d) [m]. Both rows are the direction of a plane."""
+    """Array of shape (2, d) with a box's corners relative to its middle [m], or twice the direction of a plane."""
     radius: float = 0.0
 
 
@@ -78,10 +79,10 @@ class Drained:
     mouths: Sequence[Mouth]
     pulls: Mapping[str, Pull]
     places: Points
-    """Resting positions of removed particles (n, d) [m]."""
+    """Array of shape (n, d) with the resting positions of removed particles [m]."""
     nozzles: Sequence[Nozzle]
     periods: Points
-    """Lengths of the periodic box (d,) [m]; 0 along an axis that is not periodic."""
+    """Vector of shape (d,) with the lengths of the periodic box [m], 0 along an axis that is not periodic."""
 
 
 @cache
@@ -239,7 +240,7 @@ class Drains(Part):
         counts = (StateField(count_name(one.name), "", Entry.DOUBLE, Axis.SCALAR) for one in of.mouths)
         self.fields = (DRAINED, *map(behind, of.pulls), *counts)
         self.taken = layout.arrays(taken=real, fresh=real, waits=real)
-        """Arrays (n,): number of a particle's drain; 1 if removed by the last drain; 1 if waiting in an emitter."""
+        """Arrays of shape (n,): a particle's drain; 1 if the last drain removed it; 1 if it waits in an emitter."""
         self.places = to_device(of.places, precision, device)
         self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
         self._never = layout.arrays(serial=wp.float64)["serial"]

@@ -1,14 +1,8 @@
 """Fluid from a nozzle: the motion of particles is prescribed until they pass the opening of the nozzle.
 
-A particle starts at the distance u upstream of the opening, with the offset o from the axis. The column moves with the
-speed w = Q / A, the flow rate Q divided by the area A of the opening. In each step its emitted length l grows by w dt.
-While s = u - l is positive, the particle's motion is prescribed in steps n = 0, 1, ...:
-
-    x = q_n + o - s e,   v = (q_n - q_(n-1)) / dt + w e
-
-q_n is the position of the opening after step n (at rest before the first), and e the direction of the flow. Position
-and velocity do not jump when a particle becomes free. Particles further upstream than the length of the column are in
-reserve: they rest at separate places, without derivative.
+`docs/discretisation.md` has the equations of the motion. Position and velocity do not jump when a particle becomes
+free. Particles further upstream than the length of the emitted column wait in reserve at separate places, without
+derivative.
 
 A nozzle fed by drains emits removed particles again. When the column has room for another layer at its upstream end,
 removed particles form this layer, with the same offsets as the first particles. The choice of particles has no
@@ -176,13 +170,13 @@ class Nozzle:
     first: int
     sample: EmitterSample
     direction: np.ndarray
-    """Unit vector of the flow (d,)."""
+    """Vector of shape (d,) and length 1 along the flow."""
     area: float
-    """Area of the opening [m2], in 2-D its width [m]."""
+    """Area of the opening [m2], or in 2-D the width of the opening [m]."""
     places: np.ndarray
-    """Resting positions of particles in reserve (n, d) [m]."""
+    """Array of shape (n, d) with the resting positions of particles in reserve [m]."""
     feeding: np.ndarray
-    """True for each drain that feeds the emitter (drains + 1,)."""
+    """Array of shape (drains + 1,) with True for each drain that feeds the emitter."""
 
     def part(self, layout: Layout, requires_grad: bool) -> "Emitter":
         return Emitter(self, layout, requires_grad)

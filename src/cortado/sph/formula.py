@@ -136,7 +136,7 @@ class OwnParameters:
         options: dict[str, Any] = {"dtype": dtype, "device": layout.device}
         self._theta, self._theta_dot = wp.zeros(members, **options, requires_grad=taped), wp.zeros(members, **options)
         self._theta_bar = wp.zeros(layout.all_particles, **options)
-        """Terms of particles (n,) in the adjoint of ``theta``."""
+        """Array of shape (n,) with the particles' terms in the adjoint of ``theta``."""
         self._sum_theta = layout.sum_of(dtype) if own else None
         most = min(ROWS["cpu" if layout.device.is_cpu else "cuda"], layout.particles)
         self.rows = max(min(most, MOST_PARTIAL // (members * max(self._size, 1))), 1)

@@ -1,29 +1,10 @@
-"""Helmholtz free energies F(c) = alpha f(c) of a mixture with mass fractions c, and mobilities m(c) of its phases (Yang
-et al. 2015).
+"""Free energies of a mixture, mobilities of its phases, and the Cahn-Hilliard diffusion of phases (Yang et al. 2015).
 
-    double well  f = sum_k c_k^2 (1 - c_k)^2 / 2: the mixture separates into pure phases (Lee and Kim 2015)
-    miscible     f = sum_k c_k^2 / 2: phases mix, by Fick's law
-
-    constant     m = 1
-    degenerate   m = (z + sqrt(z^2 + delta^2)) / 2,   z = sum_(k<l) c_k c_l: where phases touch
-
-The constant delta keeps the mobility positive and smooth if a fraction leaves the range from 0 to 1.
-
-The phases diffuse (Cahn-Hilliard diffusion, after Yang et al. 2015):
-
-    chi_k,i = alpha P f'(c_i)_k - (eps^2 / m_i) B(m; c_k)_i,         P u = u - (1 / phases) sum_l u_l
-    c'_k,i  = c_k,i + (dt / m_i) B(m M; chi_k)_i,                    M_i = M_0 m(c_i)
-    B(w; u)_i = V sum_j (w_i / n_j + w_j / n_i) (u_i - u_j) F_ij,    F = x^T G / (|x|^2 + 0.01 h^2)
-
-Here chi is the chemical potential, eps the interface width, M_0 the mobility of the scene, and n the number density.
-The mass of particle i divided by its volume V is m_i, and G is the kernel gradient. The terms of B are antisymmetric in
-i and j, so that the mass sum_i m_i c_k,i of each phase is constant to round-off. P keeps sum_k c_k constant. The
-discrete free energy
-
-    E = V sum_i m_i alpha f(c_i) - (eps^2 V^2 / 4) sum_ij (m_i / n_j + m_j / n_i) F_ij |c_i - c_j|^2
-
-decreases on particles at rest, because F is not positive. Fractions are not clipped, because that would break
-conservation and the decrease of energy.
+`docs/discretisation.md` has the equations. The term of a pair in the operator B is antisymmetric in the two particles,
+so that the mass of each phase is constant to round-off. The projection P keeps the sum of a particle's mass fractions
+constant. The energy E decreases on particles at rest, because the factor F is not positive. Fractions are not clipped,
+because clipping would break conservation and the decrease of energy. The constant in the degenerate mobility keeps the
+mobility positive and smooth if a fraction leaves the range from 0 to 1.
 """
 
 from collections.abc import Callable
@@ -248,7 +229,7 @@ def stable_substeps(
     scene: Scene, energy: FreeEnergy, time_step: float, mobility: float, width: float, densities: np.ndarray
 ) -> int:
     """Return the number of diffusion substeps that makes a ``time_step`` [s] stable. ``mobility`` is in m2/s, the
-    interface ``width`` in m, and the rest ``densities`` (phases,) in kg/m3. The length of a substep is at most
+    interface ``width`` in m, and the rest ``densities`` (phases,) in kg/m3. A substep lasts at most
 
         dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 

@@ -1,8 +1,8 @@
 """Free bodies without slip in the implicit viscous solve, with derivatives; see `cortado.sph.friction_kernels`.
 
-The velocities of bodies are additional unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). M is the mass
-matrix of a body, and F(u, U) the force of fluid with velocities u on the body. U are the body's velocities at the start
-of the step, with gravity and contact. The solve has the additional equations
+The velocities of bodies are additional unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). A body has the
+mass matrix M, and fluid with velocities u exerts the force F(u, U) on the body. The velocities U of the body at the
+start of the step include gravity and contact. The solve has the additional equations
 
     U' = U + M^-1 J,   J = dt F(u', U'),
 

@@ -1,12 +1,8 @@
-"""The mass fractions of a particle's phases, and its rest density and viscosity:
+"""The mass fractions, rest density and viscosity of particles in a mixture. `docs/discretisation.md` has the equations.
 
-    1 / rho = sum_k c_k / rho_k,    ln mu = sum_k c_k ln mu_k    (Arrhenius 1887)
-
-Here c_k is the mass fraction of phase k, rho and rho_k are rest densities, and mu and mu_k are viscosities. The
-logarithms keep the viscosity positive if mass fractions leave the range from 0 to 1.
-
-Phases diffuse at the start of a step, with particles at fixed positions. Particles then get new densities and
-viscosities. The mass of a particle is constant.
+The viscosity is the exponential of a mean of logarithms (Arrhenius 1887), and stays positive if mass fractions leave
+the range from 0 to 1. Phases diffuse at the start of a step, with particles at fixed positions. Particles then get new
+densities and viscosities, but keep their masses.
 """
 
 from contextlib import nullcontext
@@ -157,11 +153,11 @@ class Mixture(Part):
         self._layout = layout
         self._options = {"device": layout.device, "requires_grad": requires_grad}
         self.c: list[wp.array] = []
-        """Mass fractions of sorted particles before each diffusion substep (n,)."""
+        """Arrays of shape (n,) with sorted particles' mass fractions before each diffusion substep."""
         self.chi: list[wp.array] = []
-        """Chemical potentials of each substep (n,) [-]."""
+        """Arrays of shape (n,) with the chemical potentials of each substep [-]."""
         self.w: list[wp.array] = []
-        """Density times mobility of each substep (n,) [kg / (m s)]."""
+        """Arrays of shape (n,) with density times mobility of each substep [kg / (m s)]."""
 
     def fractions(self) -> wp.array:
         dtype = self._layout.precision.fractions(self.phases.count)

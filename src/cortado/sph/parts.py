@@ -57,7 +57,7 @@ class StepContext:
     parameters: Parameters
     bodies: Sequence[Any] = ()
     kick: wp.array | None = None
-    """Velocity changes of sorted particles by pressure in the previous step (n,) [m/s], or None."""
+    """Array of shape (n,) with sorted particles' velocity changes by the previous step's pressure [m/s], or None."""
 
     @cached_property
     def _known(self) -> tuple[Named, ...]:
@@ -98,7 +98,7 @@ class Tangents:
 
 
 class Shares(Arrays):
-    """Terms of particles in the adjoints of parameters (n,), before summation."""
+    """Arrays of shape (n,) with the particles' terms in the adjoints of parameters, before summation."""
 
     def __init__(self, names: Iterable[str], layout: Layout):
         """Raise `TypeError` for a parameter whose adjoint has no terms of particles."""
@@ -276,7 +276,7 @@ class Carried:
         self._arrays = layout.state(fields, requires_grad)
 
     def __getitem__(self, name: str) -> wp.array:
-        """Return the array of a field at the start of the step, in sorted order (n,)."""
+        """Return the array (n,) of a field at the start of the step, in sorted order."""
         return self._arrays[name]
 
     def sort(self, step: StepContext, state: State) -> None:
@@ -291,12 +291,12 @@ class Carried:
 
 
 def sort(step: StepContext, a_scene: wp.array, a: wp.array) -> None:
-    """Copy an array ``a_scene`` (n,) in the order of the scene to sorted order."""
+    """Copy the array ``a_scene`` (n,) from the order of the scene to sorted order."""
     step.launch(_kernels(a).sort, a_scene=a_scene, a=a)
 
 
 def unsort(step: StepContext, a: wp.array, a_scene: wp.array) -> None:
-    """Copy an array ``a`` (n,) in sorted order to the order of the scene."""
+    """Copy the array ``a`` (n,) from sorted order to the order of the scene."""
     step.launch(_kernels(a).unsort, a=a, a_scene=a_scene)
 
 

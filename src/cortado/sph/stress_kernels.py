@@ -1,39 +1,29 @@
-"""Viscosity as a stress. The force per volume is f = -G^T (2 mu D), with the exact transpose of the velocity gradient
-G. mu is the viscosity, and D the symmetric part of the velocity gradient.
+"""Kernels of the viscous force as the divergence of a stress. `docs/discretisation.md` has the equations.
 
-The kernel gradient is grad W = a x, so that the weight s_ij = -V a_ij is not negative. The sums of particle i over its
+The kernel gradient is a x, so that the weight s_ij = -V a_ij of a pair is not negative. The sums of particle i over its
 neighbours are
 
-    M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j,
+    M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j.
 
-and G = A M^-1 is the velocity gradient, exact for linear velocity fields (Bonet and Lok 1999). G is also the
-least-squares fit to the velocities of the neighbours with weights s_ij. The remainders v_ij - G_i x_ij are damped with
-a coefficient C, as by Ganzenmueller (2015), against modes that the gradient does not contain:
+The velocity gradient G = A M^-1 is also the least-squares fit to the velocities of the neighbours with weights s_ij.
+The force on a particle is minus half the derivative of the dissipation
 
-    m_i a_i = -sum_j s_ij ((T_i + T_j) x_ij + C (mu_i + mu_j) v_ij),   T_i = 2 mu_i D_i M_i^-1 - C mu_i G_i.
+    sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij - G_i x_ij|^2)
 
-The dissipation is sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij - G_i x_ij|^2). The force m_i a_i is minus half the
-derivative of the dissipation with respect to v_i, so that the force never adds energy. The force is 0 in rigid
-rotation, so that momentum and angular momentum are conserved.
+with respect to the particle's velocity, so that the force never adds energy. The force is 0 in rigid rotation, so that
+momentum and angular momentum are conserved.
 
-On a lattice a shear wave of wave number k decays with mu k^2 (1 + (C / 4 - 1 / (3 m_2)) k^2 m_4 + ...). Here m_2 and
-m_4 are the moments of s_ij along k. C = 4 / (3 m_2) cancels the second term in every direction and for every kernel.
+`stress_of_particle` computes the viscosity mu = S law(sqrt(2 D : D), mu_m) from the sums of one particle. The argument
+mu_m is the harmonic mean of the viscosities of the particle and its neighbours. With this mean, the shear stress is
+equal on both sides of an interface. For a Newtonian fluid the law returns mu_m.
 
-From M, A and R of one particle (`stress_of_particle`) follow
-
-    G = A M^-1,   D = (G + G^T) / 2,   mu_m = 1 / (1 / (2 mu_i) + R / (2 tr M)),
-    mu = S law(sqrt(2 D : D), mu_m).
-
-mu_m is the harmonic mean of the viscosities between i and its neighbours. With this mean, the shear stress is equal on
-both sides of an interface. For a Newtonian fluid the law returns mu_m.
-
-The factor S is 1 if neighbours lie on all sides or on one side. S falls smoothly to 0 if neighbours lie on a line or
-are missing, because M then has no inverse. With the invariants I_2 and I_3 of M,
+The factor S is 1 if neighbours lie on all sides or on one side. The factor S falls smoothly to 0 if neighbours lie on a
+line or are missing, because the matrix M then has no inverse. With the invariants I_2 and I_3 of M,
 
     H = 3 I_3 / I_2 (in 2-D 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
-Where S > 0, det M is at least 0.008: M has an inverse. Users' functions may take velocity gradients S G, with sums
-over fluid alone.
+Where S is positive, the determinant of M is at least 0.008, so that M has an inverse. Users' functions may take
+velocity gradients S G, whose sums include fluid alone.
 """
 
 from collections.abc import Callable

@@ -1,20 +1,15 @@
-"""Surface tension: by curvature (`cortado.sph.curvature`), and for PCISPH as a stress between pairs of particles
-(continuum surface stress, Lafaurie et al. 1994):
+"""Surface tension by curvature (`cortado.sph.curvature`), or for PCISPH as a stress between pairs of particles.
 
-    n_i = (1 / N) sum_j (1 - s)^2 x_ij,   s = |x|^2 / h^2
-    S_i = (|n_i|^2 1 - PART n_i n_i) / sqrt(1 + |n_i|^2)
-    m_i s^d a_i = -(sigma / Gamma) sum_j s (1 - s)^2 (S_i + S_j) x_ij
+`docs/discretisation.md` has the equations of the stress (continuum surface stress, Lafaurie et al. 1994). The surface
+normal points out of the fluid. The factor 1 / N makes the normal's length 1 in the outermost layer of a cut lattice,
+and about 0 inside the fluid. The stress S pulls along the surface. With `PART` below 1, the stress also pulls a little
+across the surface, so that particles do not detach. The force of a pair grows with distance up to 0.65 h, so that
+particles of the surface do not clump. The divisor Gamma is `RELAXED` times the surface tension that a cut lattice would
+have for sigma / Gamma = 1.
 
-The mass of a particle is m_i s^d, with the spacing s of the lattice at rest. The vector n points out of the fluid. N is
-chosen so that |n| is 1 in the outermost layer of a cut lattice, and about 0 inside. The stress S pulls along the
-surface, and with PART below 1 a little across it, so that particles do not detach. The force of a pair grows with
-distance up to 0.65 h, so that particles of the surface do not clump. Gamma is `RELAXED` times the surface tension that
-a cut lattice would have for sigma / Gamma = 1.
-
-Forces of a pair are opposite, but not parallel to the pair. Momentum is conserved, but angular momentum only
-approximately. Neither of the two forces, by curvature or by stress, is the gradient of an energy. Fluids with very low
-viscosity therefore gain energy; see `LEAST_VISCOSITY`. Walls do not take part in surface tension: a surface meets walls
-at 180 degrees.
+The forces of a pair are opposite, but not parallel to the pair, so that only momentum is exactly conserved. Neither of
+the two kinds of surface tension is the gradient of an energy. Fluids with very low viscosity therefore gain energy; see
+`LEAST_VISCOSITY`.
 """
 
 from collections.abc import Callable

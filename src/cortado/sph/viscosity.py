@@ -1,14 +1,8 @@
-"""The viscous force of pairs of particles (Monaghan 2005), which scenes with PCISPH may use instead of the viscous
-stress:
+"""The viscous force of pairs of particles (Monaghan 2005), which PCISPH may use instead of the viscous stress.
 
-    a_i = k / (m_i n_i) (sum_j (V / n_j) mu_ij phi(x_ij, v_ij) + mu_i sum_b V w_b phi(x_ib, v_ib)),
-    phi(x, v) = v . x / (|x|^2 + 0.01 h^2) G(x),   k = 2 (d + 2).
-
-The kernel's gradient is G = a x, and functions call the factor a the ``slope``. The factor 1 / (|x|^2 + 0.01 h^2) is
-called ``per_size``. A pair has the dynamic viscosity mu_ij = 2 mu_i mu_j / (mu_i + mu_j) [Pa s], which keeps the shear
-stress continuous between fluids (Cleary and Monaghan 1999). The sum over b is over walls without slip; v_ib is the
-velocity relative to the wall. Because phi(-x, -v) = -phi(x, v) points along x, momentum and angular momentum are
-conserved.
+`docs/discretisation.md` has the equations. The viscosity of a pair is the harmonic mean of two viscosities, which keeps
+the shear stress continuous between fluids (Cleary and Monaghan 1999). The forces of a pair are opposite and parallel to
+the pair, so that momentum and angular momentum are conserved.
 """
 
 from functools import cache

@@ -165,6 +165,6 @@ class Solve:
         self._free.multiply(step, known, p, self._own)
 
     def respond(self, step: StepContext, known: Any, still: wp.array, r: wp.array) -> None:
-        """Add the matrix times velocities to ``r``. Particles have the velocities ``still``."""
+        """Add the matrix times velocities to ``r``. The array ``still`` contains the velocities of particles."""
         self._apply(step, known, still)
         add(self._own["product"], r)

@@ -1,15 +1,14 @@
-"""The viscous force as a stress (`cortado.sph.stress_kernels`). The force is explicit, or implicit without a limit on
-the time step.
+"""The viscous force as a stress (`cortado.sph.stress_kernels`), which is either explicit or implicit.
 
-Let a be the acceleration by all other forces, and g(v) the acceleration by the viscous stress of fluid with velocities
-v. In g, the viscosity mu and the matrix M are those at the start of the step. The acceleration a' at the end of a step
-solves
+The implicit force does not limit the time step. Let a be the acceleration by all other forces, and g(v) the
+acceleration by the viscous stress of fluid with velocities v. The viscosity mu and the matrix M in g belong to the
+start of the step. The acceleration a' at the end of a step solves
 
-    a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y),
+    a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y).
 
-which `cortado.sph.viscous_solve` solves to round-off. B is symmetric and positive in the product sum_i m_i a_i . b_i.
-The viscosity mu is computed from the velocities v at the start, and the stress from u = v + dt a' at the end.
-Derivatives are those of the exact solution: the tangent and the adjoint each need one more solve with B.
+`cortado.sph.viscous_solve` solves this equation to round-off. The operator B is symmetric and positive in the product
+sum_i m_i a_i . b_i. The viscosity mu is computed from the velocities v at the start, and the stress from u = v + dt a'
+at the end. Derivatives are those of the exact solution: the tangent and the adjoint each need one more solve with B.
 """
 
 from collections.abc import Sequence

@@ -1,16 +1,16 @@
-"""Predictive-corrective incompressible SPH (Solenthaler and Pajarola 2009): steps, their tangent and adjoint, and two
-factors on the pressure correction of an iteration. `docs/discretisation.md` has the equations.
+"""PCISPH (Solenthaler and Pajarola 2009): steps with tangent and adjoint, and two factors on the pressure correction.
+
+`docs/discretisation.md` has the equations.
 
 *Density ratios*: The pressure correction assumes particles of equal mass, but a pressure moves lighter neighbours
 further. The iteration diverges if a density changes by more than twice the wanted amount. The density-ratio relaxation
-is 1 among particles of equal or greater mass, and tends to 1 / (1 + t / 2), the value for a lattice, for large t.
+is 1 among particles of equal or greater mass. For a large sum t over lighter neighbours, the density-ratio relaxation
+tends to 1 / (1 + t / 2), the value for a lattice.
 
 *Walls*: The pressure correction assumes a particle with a filled neighbourhood. Beside a wall, the same pressure
-changes the density of particle i more, by |S_i|^2 / (2 R). Here S_i = sum_b w_b G_ib is a sum over wall particles b,
-and R = sum_j G_j . G_j is over the kernel gradients on a lattice. A particle that approaches a wall meets a steeper
-gradient than at the start of the step. The wall relaxation 1 / (1 + |S_i|^2 / R) therefore doubles the change by walls.
-The wall relaxation changes the rate of convergence, not the limit. Sums are multiplied by R^(-1/2) before they are
-squared, because the square of a gradient overflows in float32 for small spacings.
+changes the density of the particle more. A particle that approaches a wall then meets a steeper gradient, so the wall
+relaxation doubles the change by walls. The wall relaxation changes the rate of convergence, not the limit. Gradients
+are scaled before they are squared, because the square of a gradient overflows in float32 for small spacings.
 """
 
 from collections.abc import Sequence

@@ -155,7 +155,7 @@ class Held:
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}
-        """Sums over particles of the magnitudes of their force and torque on the body."""
+        """Sums of the magnitudes of all particles' forces and torques on the body."""
 
     def at_rest(self) -> "Held":
         """Return a copy with the same arrays for a body at rest."""
@@ -169,7 +169,7 @@ class Held:
         self.whole = {f"whole{self._suffix}": self._whole(self.known[f"sizes{self._suffix}"])}
 
     def sums(self) -> Arrays:
-        """Return the momentum and angular momentum that pressures give to the body (members,)."""
+        """Return arrays of shape (members,) with the momentum and angular momentum that pressures give to the body."""
         found = (total(share) for total, share in zip(self._sums, self.shares.values(), strict=True))
         return dict(zip((f"pulled_sum{self._suffix}", f"twisted_sum{self._suffix}"), found, strict=True))
 

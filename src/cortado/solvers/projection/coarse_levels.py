@@ -1,4 +1,4 @@
-"""A multigrid method for the coarse grid of the pressure. With this method, solves take few iterations.
+"""A multigrid method for the coarse grid of the pressure, with which solves take few iterations.
 
 A level has half of the nodes of the finer level along every axis with an even number of nodes. The matrix of a level is
 R A R^T (Galerkin), where A is the matrix of the finer level and R is bilinear. Like A, the matrix R A R^T is a sum over
@@ -7,9 +7,9 @@ r is the right-hand side, and w contains the weight of each node I:
 
     w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)).
 
-If the factor W is below 2, Jacobi's method converges for every symmetric positive semidefinite matrix. With W = 1, w A
-has no eigenvalue above 1. This bound is from Baker, Falgout, Kolev and Yang (2011), applied to the matrix with its
-diagonal scaled to 1.
+If the factor W is below 2, Jacobi's method converges for every symmetric positive semidefinite matrix. With W = 1, the
+product w A has no eigenvalue above 1. Baker, Falgout, Kolev and Yang (2011) give this bound, which is applied to the
+matrix with its diagonal scaled to 1.
 """
 
 from functools import cache
@@ -139,16 +139,16 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 def pairs_of_corners(dimension: int) -> int:
-    """Return the number of pairs of corners of a cell. The pairs of a corner with itself count as well."""
+    """Return the number of pairs of corners of a cell. A corner also forms a pair with itself."""
     return 2**dimension * (2**dimension + 1) // 2
 
 
 class Level(NamedTuple):
     shape: wp.vec3i
     factor: wp.vec3i
-    """Number of nodes of the finer level divided by the number of nodes of this level, along each axis."""
+    """Ratio of the finer level's number of nodes to this level's number of nodes, along each axis."""
     cells: wp.array
-    """Contribution of each cell to the matrix (pairs of corners, cells)."""
+    """Array of shape (pairs of corners, cells) with the contribution of each cell to the matrix."""
 
 
 class Levels:
@@ -174,12 +174,12 @@ class Levels:
             for n, factor, i, j in zip(shapes, factors, at[:-1], at[1:], strict=True)
         ]
         self.cells, self.r = self.levels[0].cells, residual[: counts[0]]
-        """Contribution of each cell of the finest level to the matrix (pairs of corners, cells), and the right-hand
-        side (nodes,)."""
+        """Contributions of the finest level's cells to the matrix (pairs of corners, cells), and the right-hand side
+        (nodes,)."""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
         """Matrix of free bodies (rows, nodes)."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
-        """Number of iterations of the last solve in each scene (members,)."""
+        """Array of shape (members,) with the number of iterations in each scene's last solve."""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]
         blocks, teams, team = -(-counts[0] // members // BLOCK), members, 1
         if not device.is_cpu:

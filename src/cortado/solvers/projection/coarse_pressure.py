@@ -1,23 +1,23 @@
 """A pressure on a coarse grid of hat functions phi_I, one at each node of a `CellSort`'s grid.
 
 `docs/projection_step.md` has the equations. The share c of each particle is from `cortado.solvers.projection.effects`.
-The moment N and the push h = D^T c are from `cortado.solvers.projection.coarse_push`.
+The moment N and the push h are from `cortado.solvers.projection.coarse_push`.
 
-Two operations transfer values between nodes and particles. The operation `spread` sums phi_I s_i + grad phi_I . t_i +
-hess phi_I : R_i + e_I o_i at a node I. The sum is over the particles i of the cells around the node, in their order.
-The operation `at` gives E = sum_I phi_I e_I at a particle, its gradient G and its mixed second derivatives. With w = (N
-G + h E) / m, A e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
+Two operations transfer values between nodes and particles. At a node I, the operation `spread` sums
 
-Pressure impulses y give a free body the momentum F = sum_i y_i gamma_i and the angular momentum T = sum_i y_i r_i x
-gamma_i (`cortado.solvers.projection.bodies`). The body gets the velocity V = F / (rho K) and the angular velocity W =
-R' I^-1 R'^T T / rho. This motion reduces the divergence of particle i by gamma_i . (V + W x r_i). On the grid, bodies
-add B^T B to the matrix A, with
+    phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i
+
+over the particles i of the cells around the node, in the order of the particles. The operation `at` gives a node
+array's value E at a particle, its gradient G and its mixed second derivatives. With w = (N G + h E) / m, the product A
+e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
+
+Free bodies add B^T B to the matrix A, with
 
     B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1.
 
-F_I and T_I are the momenta for the pressure impulses y = phi_I c. For each body, B has three rows in 2-D and six rows
-in 3-D. For a body with restricted motion, the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and
-I^-1.
+Here F_I and T_I are a body's momentum and angular momentum by the pressure impulses phi_I c
+(`cortado.solvers.projection.bodies`). For each body, B has three rows in 2-D and six rows in 3-D. For a body with
+restricted motion, the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and I^-1.
 """
 
 from functools import cache

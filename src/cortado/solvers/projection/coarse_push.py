@@ -1,16 +1,12 @@
 """The force of a smooth coarse pressure on a particle, and the divergence that this pressure has to remove.
 
-The push h is the force of a constant pressure c, and the moment N is the force of a pressure's gradient. For a linear
-function phi, let particle j have the pressure k_j = c_j phi(x_j). With T = c L and the gradient correction L, the force
-D^T k of `docs/projection_step.md` is exactly
+For a linear function phi, let particle j have the pressure c_j phi(x_j). The force on particle i is then exactly
 
-    (D^T k)_i = N_i grad phi + phi(x_i) h_i,
-    N_i = -sum_j (T_j g_ij) x_ij^T - sum_j' eta_j c_j g_ij' x_ij^T,
-    h_i = sum_j T_j g_ij + T_i g_i + c_i gamma_i + sum_j' (eta_i c_i + eta_j c_j) g_ij'.
+    N_i grad phi + phi(x_i) h_i,   h = D^T c,
 
-The images of particles j have the index j'. The page calls the weight eta of an image h.
-Inside the fluid and beside mirroring walls, N is the unit matrix and h is 0. Beside wall particles, N and h have other
-values.
+with the moment N and the operator D of `docs/projection_step.md`. The push h is the force of the constant pressure c.
+The matrix T is c L, with the gradient correction L. Inside the fluid and beside mirroring walls, N is the unit matrix
+and h is 0. Beside wall particles, N and h have other values.
 """
 
 from functools import cache

@@ -28,7 +28,7 @@ class Pair:
     block: tuple[int, int]
     body: int
     far: tuple[bool, bool]
-    """Two flags, for the row and for the column: True if the body is the second solid of the hinge."""
+    """Flags of the matrix block's row and column: True if the body is the second solid of the hinge."""
 
 
 class JointArrays:
@@ -49,7 +49,7 @@ class JointArrays:
         self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:
-        """Return ``give`` and ``take`` of equation ``k``, of the second solid of the hinge if ``other`` is true."""
+        """Return matrices ``give`` and ``take`` of equation ``k``, for the hinge's second solid if ``other``."""
         way = "other_" if other else ""
         return {f"{name}{self._suffix}": self.rows[k][f"{way}{name}{self._suffix}"] for name in ("give", "take")}
 
@@ -65,7 +65,7 @@ class Row:
 
     joint: Joint
     share: float
-    """1 for the equation of the hinge's point, 0 for the equation of its axis."""
+    """Number that is 1 for the equation of the hinge's point, and 0 for the equation of the hinge's axis."""
 
     @property
     def place(self) -> str:

@@ -52,7 +52,7 @@ class MeanStress:
         return {name: sums.total(context, ALL_WALLS, *known) for name, sums in self._walls.items()}
 
     def impulses(self, context: StepContext, *known: Named) -> wp.array:
-        """Return the mean normal stress times the time step (n,) [Pa s]."""
+        """Return an array of shape (n,) with the mean normal stress times the time step [Pa s]."""
         found = self._arrays["q"]
         context.launch(self._kernels.forward, self._totals(context, known), *known, q=found)
         return found
@@ -225,7 +225,7 @@ class ImageLoads:
         self._faces = FaceShares(density.system)
 
     def total(self, step: StepContext, solid: int, p: wp.array) -> wp.array:
-        """Return the forces by pressures ``p`` (n,) [Pa] on the walls of a solid, or on all walls."""
+        """Return the forces that pressures ``p`` (n,) [Pa] exert on the walls of a solid, or on all walls."""
         found, known = self._vectors["total"], {"y": p, **self._image}
         step.launch(self._kernels.forward, known, solid=solid, total=found)
         add(self._walls.total(step, solid, known), found)

@@ -1,13 +1,12 @@
-"""A step of the projection: pressures that make velocities divergence-free, a shift of particles, and repairs of the
-density.
+"""A step of the projection: pressures that remove divergence, a shift of particles, and repairs of the density.
 
 `docs/projection_step.md` has the equations of the pressure, the shift delta and the repairs. With ``velocities_follow``
 velocities follow, to first order, the positions after the shift and the repairs (Xu, Stansby and Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 
-where M is the moment matrix, I the unit matrix, and x_K are the positions after the last repair. A is from the last
-iteration of the pressure.
+where M is the moment matrix, I the unit matrix, and x_K are the positions after the last repair. The matrix A is from
+the last iteration of the pressure.
 """
 
 from functools import cache, cached_property

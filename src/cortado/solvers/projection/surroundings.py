@@ -234,7 +234,7 @@ class Surroundings(Density):
         per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
         self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
         self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
-        """1 for each scene with a free surface, else 0 (members,)."""
+        """Array of shape (members,) with 1 for each scene with a free surface, otherwise 0."""
 
     def measure(self, context: StepContext) -> None:
         self.surfaced.zero_()
