@@ -42,7 +42,7 @@ from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.neighbourhood import Discretisation, neighbourhood_type
 from cortado.particles.pair_sums import ALL, FOOT, GROWTH, MOVING, PLACE, RUBBING, TURN, Term, scope_of
 from cortado.particles.particle_kernels import MADE, made_kernel
-from cortado.particles.state import Layout, zeros
+from cortado.particles.state import Layout, clear, zeros
 
 NAMES = ("force", "torque", "force_before", "torque_before", "growth")
 BARS = [f"{name}_bar" for name in ("after", "turned", "before", "turned_before", "scales")]
@@ -215,7 +215,7 @@ class SolidShares:
         found = dict(zip(BARS, (total(array) for total, array in sums), strict=True))
         for bar, given in self._whole[solid].items():
             add(given, found[bar])
-        self._forget(solid)
+        clear((*self._arrays[solid].values(), *self._whole[solid].values()))
         return found
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
@@ -224,12 +224,8 @@ class SolidShares:
             add(one, self._whole[solid][bar])
 
     def clear(self) -> None:
-        for solid in range(len(self._arrays)):
-            self._forget(solid)
-
-    def _forget(self, solid: int) -> None:
-        for array in (*self._arrays[solid].values(), *self._whole[solid].values()):
-            array.zero_()
+        for group in (*self._arrays, *self._whole):
+            clear(group.values())
 
 
 def share_kinds(precision: Precision) -> dict[str, Any]:

@@ -263,7 +263,59 @@ def share_kinds(layout: Layout) -> dict[str, Any]:
     return dict(zip(SHARES, (matrix, matrix, layout.precision.six), strict=True))
 
 
+class ContactsTangent:
+    def __init__(self, contacts: "Contacts", changes: Sequence[Changes]):
+        self._contacts, self._changes = contacts, changes
+        self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
+        self._lift = {"lift_dot": wp.zeros_like(contacts.lift["lift"])}
+
+    def look(self, step: StepContext, dot: Tangents) -> None:
+        contacts, members = self._contacts, self._contacts.layout.members
+        step.launch(contacts.lifts.tangent, self._lift, contacts.lift, lift_sizes(dot, "_dot"), threads=members)
+        for number, shares in enumerate(self._shares):
+            known = contacts.numbers(dot.parameters, number, "_dot"), *contacts.known(step, number)
+            all_points = contacts.contacts[number].all
+            step.launch(contacts.kernels.push.tangent, shares.each, self._lift, *known, threads=all_points)
+            moved = contacts.contacts[number].given(self._changes), shares.sums()
+            step.launch(contacts.kernels.give.tangent, *moved, *known, threads=members)
+
+
+def lift_sizes(of: Tangents | Adjoints, suffix: str) -> Arrays:
+    return {f"{name}{suffix}": of.parameters[name] for name in ("time_step", "gravity")}
+
+
+class ContactsAdjoint:
+    def __init__(self, contacts: "Contacts", changes: Sequence[Changes]):
+        self._contacts, self._changes, layout = contacts, changes, contacts.layout
+        vectors = [*OWN, *(f"other_{name}" for name in OWN), "lift"]
+        kinds = dict.fromkeys(vectors, layout.precision.vector)
+        kinds |= dict.fromkeys(("other_scales", *NUMBERS), layout.precision.real)
+        self._moved = [Totals(contact, kinds, "_bar", end="") for contact in contacts.contacts]
+        sums = {f"{name}_sum_bar": (layout.members, kind) for name, kind in share_kinds(layout).items()}
+        self._sums = zeros(sums, layout.device)
+
+    def look(self, step: StepContext, bar: Adjoints) -> None:
+        contacts, members = self._contacts, self._contacts.layout.members
+        for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
+            numbers = contacts.numbers(bar.parameters, number, "_bar")
+            known = (self._sums, *contacts.known(step, number))
+            given = contact.given(self._changes)
+            step.launch(contacts.kernels.give.adjoint, given, numbers, *known, threads=members)
+            step.launch(contacts.kernels.push.adjoint, moved.each, *known, threads=contact.all)
+            bars = moved.sums()
+            for name in NUMBERS:
+                add(bars[f"{name}_bar"], numbers[f"{name}_bar"])
+            step.launch(contacts.lifts.adjoint, lift_sizes(bar, "_bar"), bars, contacts.lift, threads=members)
+            own = [f"{name}_bar" for name in OWN]
+            bar.solids.add_whole(contacts.bodies(number)[0].table.number, **{name: bars[name] for name in own})
+            if contact.touching.against >= 0:
+                others = {name: bars[f"other_{name}"] for name in (*own, "scales_bar")}
+                bar.solids.add_whole(contact.touching.against, **others)
+
+
 class Contacts:
+    derivatives = ContactsTangent, ContactsAdjoint
+
     def __init__(self, part: FreeSolidsPart, touching: Sequence[Touching], spacing: float, periods: Points):
         """``periods`` (d,) are the lengths of the periodic box [m], 0 along axes that are not periodic."""
         layout = part.layout
@@ -319,59 +371,3 @@ class Contacts:
             step.launch(self.kernels.push.forward, shares.each, *self.known(step, number), threads=contact.all)
             self._sums[number], given = shares.sums(), contact.given(self.part.bodies)
             step.launch(self.kernels.give.forward, given, *self.known(step, number), threads=self.layout.members)
-
-    def tangent(self, changes: Sequence[Changes]) -> "ContactsTangent":
-        return ContactsTangent(self, changes)
-
-    def adjoint(self, changes: Sequence[Changes]) -> "ContactsAdjoint":
-        return ContactsAdjoint(self, changes)
-
-
-class ContactsTangent:
-    def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
-        self._contacts, self._changes = contacts, changes
-        self._shares = [Totals(contact, share_kinds(contacts.layout), "_dot") for contact in contacts.contacts]
-        self._lift = {"lift_dot": wp.zeros_like(contacts.lift["lift"])}
-
-    def look(self, step: StepContext, dot: Tangents) -> None:
-        contacts, members = self._contacts, self._contacts.layout.members
-        step.launch(contacts.lifts.tangent, self._lift, contacts.lift, lift_sizes(dot, "_dot"), threads=members)
-        for number, shares in enumerate(self._shares):
-            known = contacts.numbers(dot.parameters, number, "_dot"), *contacts.known(step, number)
-            all_points = contacts.contacts[number].all
-            step.launch(contacts.kernels.push.tangent, shares.each, self._lift, *known, threads=all_points)
-            moved = contacts.contacts[number].given(self._changes), shares.sums()
-            step.launch(contacts.kernels.give.tangent, *moved, *known, threads=members)
-
-
-def lift_sizes(of: Tangents | Adjoints, suffix: str) -> Arrays:
-    return {f"{name}{suffix}": of.parameters[name] for name in ("time_step", "gravity")}
-
-
-class ContactsAdjoint:
-    def __init__(self, contacts: Contacts, changes: Sequence[Changes]):
-        self._contacts, self._changes, layout = contacts, changes, contacts.layout
-        vectors = [*OWN, *(f"other_{name}" for name in OWN), "lift"]
-        kinds = dict.fromkeys(vectors, layout.precision.vector)
-        kinds |= dict.fromkeys(("other_scales", *NUMBERS), layout.precision.real)
-        self._moved = [Totals(contact, kinds, "_bar", end="") for contact in contacts.contacts]
-        sums = {f"{name}_sum_bar": (layout.members, kind) for name, kind in share_kinds(layout).items()}
-        self._sums = zeros(sums, layout.device)
-
-    def look(self, step: StepContext, bar: Adjoints) -> None:
-        contacts, members = self._contacts, self._contacts.layout.members
-        for number, (contact, moved) in enumerate(zip(contacts.contacts, self._moved, strict=True)):
-            numbers = contacts.numbers(bar.parameters, number, "_bar")
-            known = (self._sums, *contacts.known(step, number))
-            given = contact.given(self._changes)
-            step.launch(contacts.kernels.give.adjoint, given, numbers, *known, threads=members)
-            step.launch(contacts.kernels.push.adjoint, moved.each, *known, threads=contact.all)
-            bars = moved.sums()
-            for name in NUMBERS:
-                add(bars[f"{name}_bar"], numbers[f"{name}_bar"])
-            step.launch(contacts.lifts.adjoint, lift_sizes(bar, "_bar"), bars, contacts.lift, threads=members)
-            own = [f"{name}_bar" for name in OWN]
-            bar.solids.add_whole(contacts.bodies(number)[0].table.number, **{name: bars[name] for name in own})
-            if contact.touching.against >= 0:
-                others = {name: bars[f"other_{name}"] for name in (*own, "scales_bar")}
-                bar.solids.add_whole(contact.touching.against, **others)

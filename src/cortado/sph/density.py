@@ -75,32 +75,17 @@ def density_kernels(discretisation: Discretisation, topic: str = "density") -> K
     )
 
 
-class Density:
-    def __init__(self, discretisation: Discretisation, topic: str, kernels: Kernels | None = None):
-        self.discretisation, self.topic = discretisation, topic
-        self.kernels = kernels or density_kernels(discretisation, topic)
-
-    def measure(self, context: StepContext) -> None:
-        context.launch(self.kernels.forward)
-
-    def new_tangent(self) -> "DensityTangent":
-        return DensityTangent(self)
-
-    def new_adjoint(self) -> "DensityAdjoint":
-        return DensityAdjoint(self)
-
-
 class DensityTangent:
-    def __init__(self, density: Density):
-        self._density = density
+    def __init__(self, density: "Density"):
+        self._density: Any = density
 
     def measure(self, context: StepContext, dot: Tangents) -> None:
         context.launch(self._density.kernels.tangent, *dot.named)
 
 
 class DensityAdjoint:
-    def __init__(self, density: Density):
-        self._density = density
+    def __init__(self, density: "Density"):
+        self._density: Any = density
 
     def begin(self) -> None:
         """Set the adjoints to 0."""
@@ -110,6 +95,23 @@ class DensityAdjoint:
         context.launch(density.kernels.adjoint, *bar.named)
         kernel = partial(density_solid_kernel, density.discretisation, density.topic)
         bar.solids.add(context.launch, kernel, *bar.named, bar=bar.fields["n"])
+
+
+class Density:
+    derivatives: tuple[type[DensityTangent], type[DensityAdjoint]] = DensityTangent, DensityAdjoint
+
+    def __init__(self, discretisation: Discretisation, topic: str, kernels: Kernels | None = None):
+        self.discretisation, self.topic = discretisation, topic
+        self.kernels = kernels or density_kernels(discretisation, topic)
+
+    def measure(self, context: StepContext) -> None:
+        context.launch(self.kernels.forward)
+
+    def new_tangent(self) -> Any:
+        return self.derivatives[0](self)
+
+    def new_adjoint(self) -> Any:
+        return self.derivatives[1](self)
 
 
 @cache

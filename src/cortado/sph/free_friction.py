@@ -23,7 +23,7 @@ import warp as wp
 from cortado.device.launching import Named
 from cortado.device.reduction import add
 from cortado.particles.mirrors import ALL_WALLS
-from cortado.particles.state import Layout, zeros
+from cortado.particles.state import Layout, clear, zeros
 from cortado.scene.motions import free
 from cortado.sph.free_solids import Changes, FreeBody, Motions
 from cortado.sph.friction_kernels import friction_kernels, lift_kernels, row_kernels
@@ -258,8 +258,7 @@ class FrictionAdjoint(FrictionChanges):
 
     def begin(self, step: StepContext, bar: Adjoints) -> None:
         for _, bars, _, _ in self._each(step, bar):
-            for array in bars.arrays.values():
-                array.zero_()
+            clear(bars.arrays.values())
 
     def take(self, step: StepContext, bar: Adjoints) -> None:
         for change, _, _, rows in self._each(step, bar):
@@ -292,8 +291,7 @@ class FrictionAdjoint(FrictionChanges):
         self._shared(step, self._friction.kernels.rub.adjoint, bars.arrays, *groups)
 
     def _shared(self, step: StepContext, kernel: Any, motion_bar: Named, *known: Named) -> None:
-        for array in self._shares.values():
-            array.zero_()
+        clear(self._shares.values())
         step.launch(kernel, self._shares, *known)
         for name, share in self._shares.items():
             add(self._sum(share), motion_bar[name])

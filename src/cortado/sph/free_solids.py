@@ -25,7 +25,7 @@ from cortado.discretise.solid import Mass
 from cortado.errors import MissingDerivativeError
 from cortado.particles.moving_walls import MovingWalls
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.particles.state import Entry, Layout, Parameters, State, StateField
+from cortado.particles.state import Entry, Layout, Parameters, State, StateField, clear
 from cortado.scene.links import Hold, Joint, inertia_about
 from cortado.scene.motions import AXES, angular_velocity_name, position_name, rotation_name, velocity_name
 from cortado.scene.parameters import Axis
@@ -152,14 +152,12 @@ class FreeSolids:
 class Push(Protocol):
     """Protocol of forces on free bodies in addition to fluid and gravity, such as contacts and springs."""
 
+    @property
+    def derivatives(self) -> tuple[type, type]:
+        """Classes of tangent and adjoint. Their methods ``look`` add to `Changes.given`, or read the adjoints there."""
+
     def look(self, step: StepContext) -> None:
         """Add the momenta by this force to `FreeBody.given` of the rigid bodies."""
-
-    def tangent(self, changes: "Sequence[Changes]") -> Any:
-        """Return the tangent. Its method ``look(step, dot)`` adds to `Changes.given`."""
-
-    def adjoint(self, changes: "Sequence[Changes]") -> Any:
-        """Return the adjoint. Its method ``look(step, bar)`` reads the adjoints in `Changes.given`."""
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
@@ -219,16 +217,15 @@ class Changes(Motions):
         return {**self.body.state(state, self._suffix), **self.body.state(state, f"_new{self._suffix}"), **sizes}
 
     def clear(self) -> None:
-        groups = self.before, self.moved, self.given, self.pressed
-        for array in (*(array for group in groups for array in group.values()), self.turned_end):
-            array.zero_()
+        for group in (self.before, self.moved, self.given, self.pressed, {"turned_end": self.turned_end}):
+            clear(group.values())
 
 
 class FreeSolidsTangent(PartTangent):
     def __init__(self, part: Any):
         super().__init__(part)
         self.bodies = [Changes(body, part.layout, "_dot") for body in part.bodies]
-        self._pushes = [push.tangent(self.bodies) for push in part.pushes]
+        self._pushes = [push.derivatives[0](push, self.bodies) for push in part.pushes]
 
     def begin(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         for own in self.bodies:
@@ -237,8 +234,7 @@ class FreeSolidsTangent(PartTangent):
 
     def sort(self, step: StepContext, dot: Tangents, state_dot: State) -> None:
         for own in self.bodies:
-            for array in own.given.values():
-                array.zero_()
+            clear(own.given.values())
         for push in self._pushes:
             push.look(step, dot)
 
@@ -252,7 +248,7 @@ class FreeSolidsAdjoint(PartAdjoint):
     def __init__(self, part: Any):
         super().__init__(part)
         self.bodies = [Changes(body, part.layout, "_bar") for body in part.bodies]
-        self._pushes = [push.adjoint(self.bodies) for push in reversed(part.pushes)]
+        self._pushes = [push.derivatives[1](push, self.bodies) for push in reversed(part.pushes)]
 
     def end(self, step: StepContext, bar: Any, state_bar: State, moved_bar: State) -> State:
         for own in self.bodies:
@@ -293,8 +289,7 @@ class FreeSolidsPart(Part):
 
     def sort(self, step: StepContext, state: State) -> None:
         for body in self.bodies:
-            for array in body.given.values():
-                array.zero_()
+            clear(body.given.values())
         for push in self.pushes:
             push.look(step)
 

@@ -28,7 +28,7 @@ from cortado.device.modules import Kernels, kernel_module
 from cortado.device.precision import Precision, TypesByName, struct_of
 from cortado.particles.moving_walls import resting_pose
 from cortado.particles.particle_kernels import pointwise_kernels
-from cortado.particles.state import Layout, Parameters, zeros
+from cortado.particles.state import Layout, Parameters, clear, zeros
 from cortado.scene.links import Ends, Joint
 from cortado.sph.free_solids import Changes, FreeBody, FreeSolidsPart, given_to
 from cortado.sph.parts import Adjoints, StepContext, Tangents
@@ -119,7 +119,50 @@ def spring_kernels(precision: Precision) -> tuple[Kernels, Kernels, Kernels]:
     return pulls, reads, pointwise_kernels(precision, modules, lambda _: twist, given[1::2], turned=TURNED, **names)
 
 
+def numbers_of(parameters: Parameters, name: str, ends: Sequence[str], suffix: str = "") -> Named:
+    return {f"{end}{suffix}": parameters[f"{name}.{end}"] for end in ends}
+
+
+class SpringsTangent:
+    def __init__(self, springs: "Springs", changes: Sequence[Changes]):
+        self._springs, self._changes = springs, changes
+
+    def look(self, step: StepContext, dot: Tangents) -> None:
+        own, sizes = self._springs, {"time_step_dot": dot.parameters["time_step"]}
+        for kernels, of, ends, known in own.each(step, self._changes):
+            dots = numbers_of(dot.parameters, of.name, ends, "_dot"), sizes, self._changes[of.body].before
+            step.launch(kernels.tangent, *dots, *known, threads=own.layout.members)
+
+
+class PoseBars:
+    def __init__(self, springs: "Springs"):
+        self._springs, layout = springs, springs.layout
+        names = (TURNED.get(name, name) for own, other, *_ in POSES for name in (own, other))
+        self.named = zeros({f"{one}_bar": (layout.members, layout.precision.vector) for one in names}, layout.device)
+
+    def add(self, of: Ends | Joint, bar: Adjoints) -> None:
+        for k, number in enumerate((self._springs.number(of.body), of.against)):
+            if number >= 0:
+                names = {f"{row[3]}_bar": f"{TURNED.get(row[k], row[k])}_bar" for row in POSES}
+                bar.solids.add_whole(number, **{name: self.named[one] for name, one in names.items()})
+        clear(self.named.values())
+
+
+class SpringsAdjoint:
+    def __init__(self, springs: "Springs", changes: Sequence[Changes]):
+        self._springs, self._changes, self._poses = springs, changes, PoseBars(springs)
+
+    def look(self, step: StepContext, bar: Adjoints) -> None:
+        own, sizes = self._springs, {"time_step_bar": bar.parameters["time_step"]}
+        for kernels, of, ends, known in own.each(step, self._changes):
+            bars = numbers_of(bar.parameters, of.name, ends, "_bar"), sizes, self._changes[of.body].before
+            step.launch(kernels.adjoint, *bars, self._poses.named, *known, threads=own.layout.members)
+            self._poses.add(of, bar)
+
+
 class Springs:
+    derivatives = SpringsTangent, SpringsAdjoint
+
     def __init__(self, part: FreeSolidsPart, springs: Sequence[Ends], turned: Sequence[Joint], layout: Layout):
         self.part, self.springs, self.turned, self.layout = part, springs, turned, layout
         self.pull, self.read, self.twist = spring_kernels(layout.precision)
@@ -161,54 +204,6 @@ class Springs:
     def look(self, step: StepContext) -> None:
         for kernels, _, _, known in self.each(step, self.part.bodies):
             step.launch(kernels.forward, *known, threads=self.layout.members)
-
-    def tangent(self, changes: Sequence[Changes]) -> "SpringsTangent":
-        return SpringsTangent(self, changes)
-
-    def adjoint(self, changes: Sequence[Changes]) -> "SpringsAdjoint":
-        return SpringsAdjoint(self, changes)
-
-
-def numbers_of(parameters: Parameters, name: str, ends: Sequence[str], suffix: str = "") -> Named:
-    return {f"{end}{suffix}": parameters[f"{name}.{end}"] for end in ends}
-
-
-class SpringsTangent:
-    def __init__(self, springs: Springs, changes: Sequence[Changes]):
-        self._springs, self._changes = springs, changes
-
-    def look(self, step: StepContext, dot: Tangents) -> None:
-        own, sizes = self._springs, {"time_step_dot": dot.parameters["time_step"]}
-        for kernels, of, ends, known in own.each(step, self._changes):
-            dots = numbers_of(dot.parameters, of.name, ends, "_dot"), sizes, self._changes[of.body].before
-            step.launch(kernels.tangent, *dots, *known, threads=own.layout.members)
-
-
-class PoseBars:
-    def __init__(self, springs: Springs):
-        self._springs, layout = springs, springs.layout
-        names = (TURNED.get(name, name) for own, other, *_ in POSES for name in (own, other))
-        self.named = zeros({f"{one}_bar": (layout.members, layout.precision.vector) for one in names}, layout.device)
-
-    def add(self, of: Ends | Joint, bar: Adjoints) -> None:
-        for k, number in enumerate((self._springs.number(of.body), of.against)):
-            if number >= 0:
-                names = {f"{row[3]}_bar": f"{TURNED.get(row[k], row[k])}_bar" for row in POSES}
-                bar.solids.add_whole(number, **{name: self.named[one] for name, one in names.items()})
-        for array in self.named.values():
-            array.zero_()
-
-
-class SpringsAdjoint:
-    def __init__(self, springs: Springs, changes: Sequence[Changes]):
-        self._springs, self._changes, self._poses = springs, changes, PoseBars(springs)
-
-    def look(self, step: StepContext, bar: Adjoints) -> None:
-        own, sizes = self._springs, {"time_step_bar": bar.parameters["time_step"]}
-        for kernels, of, ends, known in own.each(step, self._changes):
-            bars = numbers_of(bar.parameters, of.name, ends, "_bar"), sizes, self._changes[of.body].before
-            step.launch(kernels.adjoint, *bars, self._poses.named, *known, threads=own.layout.members)
-            self._poses.add(of, bar)
 
 
 def springs_in(solver: Any) -> Iterator[tuple[Springs, Ends]]:

@@ -27,6 +27,7 @@ from cortado.device.reduction import add
 from cortado.discretise.smoothing import stress_control
 from cortado.errors import MissingDerivativeError
 from cortado.particles.particle_kernels import particle_kernel
+from cortado.particles.state import clear
 from cortado.particles.wall_terms import WallTerm, WorkMaker, solid_kernel
 from cortado.scene.parameters import Parameter
 from cortado.scene.scene import Scene
@@ -178,8 +179,7 @@ class StressWalls:
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
         now, bars = self._stress.resisted(step), self._bars
-        for name in ("T_bar", "eta_bar", "v_bar"):
-            bars[name].zero_()
+        clear(bars[name] for name in ("T_bar", "eta_bar", "v_bar"))
         self._sums.adjoint(step, bar, solid, total_bar, v_star_bar, bars, now)
         self._stress.free.bars.begin(step, bar)
         self._stress.free.bars.act(step, bar, solid, self._name, total_bar, bars, now)

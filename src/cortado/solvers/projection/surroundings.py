@@ -225,32 +225,8 @@ def surrounding_kernels(discretisation: Discretisation, dimension: int) -> Kerne
     return Kernels(surroundings, surroundings_tangent, (own_adjoint, sums_adjoint))
 
 
-class Surroundings(Density):
-    def __init__(self, system: ParticleSystem, topic: str, constants: ProjectionConstants):
-        kernels = surrounding_kernels(system.discretisation, system.walled.dimension)
-        super().__init__(system.discretisation, topic, kernels)
-        self.system, layout = system, system.layout
-        self.around = layout.arrays(**entries(layout.precision))
-        per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
-        self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
-        self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
-        """Array of shape (members,) with 1 for each scene with a free surface, otherwise 0."""
-
-    def measure(self, context: StepContext) -> None:
-        self.surfaced.zero_()
-        context.launch(self.kernels.forward, self.around, self.constants, surfaced=self.surfaced)
-
-    def new_tangent(self) -> "SurroundingsTangent":
-        return SurroundingsTangent(self)
-
-    def new_adjoint(self) -> "SurroundingsAdjoint":
-        return SurroundingsAdjoint(self)
-
-
 class SurroundingsTangent(DensityTangent):
-    _density: Surroundings
-
-    def __init__(self, surroundings: Surroundings):
+    def __init__(self, surroundings: "Surroundings"):
         super().__init__(surroundings)
         layout = surroundings.system.layout
         self.around = layout.arrays("_dot", **entries(layout.precision))
@@ -261,9 +237,7 @@ class SurroundingsTangent(DensityTangent):
 
 
 class SurroundingsAdjoint(DensityAdjoint):
-    _density: Surroundings
-
-    def __init__(self, surroundings: Surroundings):
+    def __init__(self, surroundings: "Surroundings"):
         super().__init__(surroundings)
         layout, precision = surroundings.system.layout, surroundings.system.layout.precision
         self.around = layout.arrays("_bar", **bar_entries(precision))
@@ -280,3 +254,21 @@ class SurroundingsAdjoint(DensityAdjoint):
         bar.solids.add(context.launch, partial(solid_kernel, own.discretisation, "projection", beside_term), *known)
         images = {"density": self.around["images_bar"], "swept": self.around["sweep_bar"]}
         self._faces.add(context, bar, context.fields.named(), own.around, images)
+
+
+class Surroundings(Density):
+    derivatives = SurroundingsTangent, SurroundingsAdjoint
+
+    def __init__(self, system: ParticleSystem, topic: str, constants: ProjectionConstants):
+        kernels = surrounding_kernels(system.discretisation, system.walled.dimension)
+        super().__init__(system.discretisation, topic, kernels)
+        self.system, layout = system, system.layout
+        self.around = layout.arrays(**entries(layout.precision))
+        per_nearest, per_apart = 1.0 / constants.nearest_weight, (APART * constants.spacing) ** -2
+        self.constants = {"least": constants.least_diagonal, "per_nearest": per_nearest, "per_apart": per_apart}
+        self.surfaced = wp.zeros(layout.members, dtype=wp.int32, device=layout.device)
+        """Array of shape (members,) with 1 for each scene with a free surface, otherwise 0."""
+
+    def measure(self, context: StepContext) -> None:
+        self.surfaced.zero_()
+        context.launch(self.kernels.forward, self.around, self.constants, surfaced=self.surfaced)
