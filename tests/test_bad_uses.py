@@ -72,7 +72,7 @@ REFUSED = [
     (lambda at: at.step({PATH: at.np.zeros((4, 2))}, steps=2), "parameter paddle.displacement has shape (4, 2), but"),
     (lambda at: at.jax.grad(lambda a: at.loss({"gravity": [a, 0.0]}))(1.0), "numbers: make one with jax.numpy.stack"),
     (lambda at: at.loss({3: 1.0}), "parameters has the name 3, but must have texts as names."),
-    (lambda at: at.step_from({**at.state, "positions": np.zeros((48, 2), np.float32)}), "state positions are usually"),
+    (lambda at: at.step_from({**at.state, "positions": np.zeros((48, 2), np.float32)}), "positions has a typical"),
     (lambda at: at.step_from(at.layer.state(at.other)), "state has positions, velocities, mass_fractions,"),
     (lambda at: at.step_from(at.layer.state(at.batch)), "state positions has shape (2, 48, 2), but must be (48, 2)."),
     (lambda at: at.layer.step(cortado.Simulation(at.scene), at.state), "state positions is float64, but must be"),

@@ -110,7 +110,7 @@ def test_a_single_phase_has_no_parameters_of_a_mixture(name):
 
 def test_guided_is_named_where_it_is_given_a_batch():
     problem = cortado.Problem(cortado.Simulation(cortado.Scene(**plane()), batch=2), 1, at().loss)
-    with pytest.raises(InputError, match=r"^Guided is given a problem of a batch"):
+    with pytest.raises(InputError, match=r"^Guided is given a problem with a batch"):
         problem.estimate({"gravity": np.zeros((2, 1, 2))}, gradients.Guided())
 
 

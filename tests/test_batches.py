@@ -211,7 +211,7 @@ def test_a_batch_of_one_has_an_axis_and_gradients_an_entry_for_each_scene():
 
 def test_parameters_that_do_not_fit_are_said():
     for given, sentence in [
-        ({"gravity": np.zeros((4, 2))}, r"gravity has shape \(4, 2\), which may be a row for each step or"),
+        ({"gravity": np.zeros((4, 2))}, r"gravity has shape \(4, 2\), whose first axis may count the steps or"),
         ({"gravity": np.zeros((3, 4, 2))}, r"gravity has shape \(3, 4, 2\), but must be .*\(4, 1, 2\) or \(4, 4, 2\)"),
         ({"viscosity": np.zeros(3)}, r"viscosity has shape \(3,\), but must be \(\) or \(4,\)"),
         ({"viscosity": -np.ones(4)}, "viscosity is -1.0, but must be at least 0"),
@@ -230,7 +230,7 @@ def test_substeps_of_diffusion_must_be_the_same():
 def test_estimators_that_run_batches_are_given_single_scenes():
     problem = Problem(Simulation(scenes.plane(), batch=2), 2, CentreOfMass([0.1, 0.1]))
     for estimator in (gradients.RandomizedSmoothing(), gradients.EnsembleMean()):
-        with pytest.raises(InputError, match="is given a problem of a batch, but must be given one of a single scene"):
+        with pytest.raises(InputError, match="is given a problem with a batch of scenes, but needs a single scene"):
             problem.value_and_gradient({"gravity": [0.0, -9.0]}, estimator)
 
 
@@ -299,7 +299,7 @@ def test_a_force_of_a_users_own_is_not_trusted_with_a_batch(monkeypatch):
 
 def test_one_scene_is_certified_and_optimised():
     problem = Problem(Simulation(scenes.plane(), batch=2), 2, CentreOfMass([0.1, 0.1]))
-    with pytest.raises(InputError, match="problem is of a batch, but must be of one scene"):
+    with pytest.raises(InputError, match="problem has a batch of scenes, but must have a single scene"):
         cortado.certify(problem, {"gravity": [0.0, -9.0]})
     with pytest.raises(InputError, match=r"The problem's loss has shape \(2,\), but must be one number"):
         cortado.optimise(problem, {"gravity": [0.0, -9.0]}, "adam", learning_rate=0.1, iterations=1)

@@ -215,7 +215,7 @@ def test_a_scene_needs_only_a_number_of_steps():
     whole = certify(problem_of(dam, 6, lambda simulation: losses.FinalPositions(simulation.positions)))
     for subject in (path, str(path), dam, Simulation(dam)):
         assert certify(subject, steps=6).as_dict() == whole.as_dict()
-    with pytest.raises(InputError, match=r"^steps is left out, but must be given to certify a \w+, which is not"):
+    with pytest.raises(InputError, match=r"^steps is left out, but must be given, as a \w+ has no number of"):
         certify(dam)
 
 

@@ -179,7 +179,7 @@ def test_parameters_that_cannot_be_are_refused():
     with pytest.raises(InputError, match=r"initial_positions has particle 0 at \(5.025, 0.025\) m, outside"):
         problem.value({"initial_positions": simulation.positions + [5.0, 0.0]})
     middle = simulation.positions.mean(axis=0)
-    with pytest.raises(InputError, match=r"initial_positions has all particles within 0\.002\d* m2, but must leave"):
+    with pytest.raises(InputError, match=r"initial_positions has all particles within 0\.002\d* m2, but the fluid"):
         problem.value({"initial_positions": middle + 0.001 * (simulation.positions - middle)})
     with pytest.raises(InputError, match="rest_density has a value of size 1e"):
         problem.value_and_gradient({"rest_density": 1e300})

@@ -169,8 +169,8 @@ def test_the_error_is_that_at_the_measured_times(recorded, cortado_command, head
     ("text", "words"),
     [
         ("time,gauge.depth\n0,1\n", "has the column 'gauge.depth', but must have some of gauge.height, gauge.f"),
-        ("time,gauge.height [mm]\n0,1\n", "has gauge.height in mm, but must have it in m"),
-        ("gauge.height\n1\n", "but must have time [s], and some of gauge.height"),
+        ("time,gauge.height [mm]\n0,1\n", "has gauge.height in mm, but gauge.height must be in m"),
+        ("gauge.height\n1\n", "but must have time [s], and at least one of gauge.height"),
         ("time\n1\n", "has only times"),
         ("time,gauge.height\n2,1\n", "has no value of gauge.height from 0 to 1 s"),
         ("", "must have a line of different names"),

@@ -169,7 +169,7 @@ def test_a_scene_that_does_not_bear_its_first_steps(capsys, monkeypatch):
         ("absent.toml", "cannot be read"),
         ("scene.toml --steps 0", "steps is 0"),
         ("scene.toml --steps 5 --time 1", "--time is given, but must be left out"),
-        ("scene.toml --time 1e30", "must be less, as that takes about"),
+        ("scene.toml --time 1e30", "must be less, as such a run takes about"),
         ("scene.toml --fps -1", "--fps is -1"),
         ("scene.toml --picture scene.toml/a.png", "cannot be written"),
         ("scene.toml --picture .", "--picture is '.', but must be the name of a PNG file"),

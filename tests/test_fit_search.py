@@ -342,7 +342,7 @@ def test_a_table_that_says_two_things_is_a_sentence(task):
         ("sensor", SERIES, "has the time 0.02 s after 0.04 s"),
         ("sensor", SERIES.replace("time", "height"), "has 2 columns 'height'"),
         ("sensor", SERIES.replace("0.02", ""), "line 4 has the time nan"),
-        ("sensor", SERIES.replace("time", "time [ms]"), "has time in ms, but must have it in s"),
+        ("sensor", SERIES.replace("time", "time [ms]"), "has time in ms, but time must be in s"),
     ]:
         (task.parent / "table.csv").write_text(text)
         kind = 'kind = "tracks"' if given == "tracks" else 'kind = "sensor"\nsensor = "left"'

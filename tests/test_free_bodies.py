@@ -299,7 +299,7 @@ def test_what_a_body_cannot_be_is_a_sentence(changes, tables, sentence):
     [
         ({"name": "raft"}, "position and rotation are left out"),
         ({"name": "raft", "position": [0.0, 0.0], "length": 0.0}, "length is 0.0"),
-        ({"name": "boat", "position": [0.0, 0.0]}, "name is 'boat', but must be that of a solid that moves: raft"),
+        ({"name": "boat", "position": [0.0, 0.0]}, "name is 'boat', but must be the name of a moving solid: raft"),
         ({"name": "raft", "position": [0.0, 0.0, 0.0]}, r"position has shape \(3,\), but must be \(2,\)"),
     ],
 )

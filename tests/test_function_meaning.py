@@ -179,17 +179,17 @@ def at_the_line_of_another():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: either, "either has 'a or b', which is an operand in Python but True or False in Warp"),
-        (lambda: digits, "digits rounds to digits"),
-        (lambda: shadowed, "shadowed cannot be compiled: it calls clamp, but may only call functions of Warp"),
-        (lambda: elsewhere, r"elsewhere has the index int\(b\), but must have whole numbers there"),
-        (lambda: twice_named, "twice_named gives k, which a loop counts with, another value too"),
-        (lambda: helped_ratio, "helped_ratio calls a function of Warp with '1 / 2', which is another number in Python"),
+        (lambda: either, "either has 'a or b', which is one of its operands in Python but True or False in Warp"),
+        (lambda: digits, "digits must call round with one number only"),
+        (lambda: shadowed, "shadowed cannot be compiled: the code calls clamp, but may only call functions of Warp"),
+        (lambda: elsewhere, r"elsewhere has the index int\(b\), but indices must be whole numbers"),
+        (lambda: twice_named, "twice_named assigns to k, which is also the counter of a loop"),
+        (lambda: helped_ratio, "helped_ratio calls a function of Warp with '1 / 2', which has another value in Python"),
         (lambda: helped_remainder, "calls a function of Warp with 'r % wp.float64"),
-        (lambda: doubled(plain), "plain is one that a decorator has put around another"),
-        (lambda: helped_doubled, "doubled_helper that .* calls is one that a decorator has put around another"),
+        (lambda: doubled(plain), "plain has a decorator, which Warp would ignore"),
+        (lambda: helped_doubled, "doubled_helper that .* calls has a decorator, which Warp would ignore"),
         (lambda: functools.partial(plain), "Rheology has functools.partial"),
-        (at_the_line_of_another, "the text of Rheology function plain in .* is not what runs where Python calls it"),
+        (at_the_line_of_another, "code of Rheology function plain in .* differs from the code that Python runs"),
     ],
 )
 def test_what_warp_would_take_for_something_else_is_refused(make, said):
@@ -222,7 +222,7 @@ def test_a_file_that_has_changed_since_it_was_imported_is_refused(module, edited
     made = module(PUSH)
     Body(made.push)
     Path(made.__file__).write_text(edited)
-    with pytest.raises(InputError, match=r"Body function push .*(is not what runs|is not to be found)"):
+    with pytest.raises(InputError, match=r"Body function push .*(differs from the code|is not found)"):
         Body(made.push)
 
 
@@ -263,5 +263,5 @@ def test_what_a_force_names_is_frozen_with_all_that_it_calls(monkeypatch):
     np.testing.assert_allclose(ends[0], 6.0 * 3.0 + 2.0, rtol=1e-12)
     np.testing.assert_allclose(ends[1], 5.0 * (150.0 * 30.0 + 20.0), rtol=1e-12)
     assert force.fingerprint != other.fingerprint
-    with pytest.raises(InputError, match="what the Body function helped names or calls has changed since"):
+    with pytest.raises(InputError, match="a value or function that the Body function helped uses has changed since"):
         pickle.loads(pickle.dumps(other))

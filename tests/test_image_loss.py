@@ -103,7 +103,7 @@ def test_a_target_cannot_be_changed_behind_the_back_and_has_the_size_of_the_pict
         loss.target[0] = 1.0
     light = "but must be linear light from 0 to 1, as"
     for target, wanted in [
-        (np.zeros((16, 21, 3)), r"shape \(16, 21, 3\), but must have that of the renderer's .*, \(16, 20, 3\)\.$"),
+        (np.zeros((16, 21, 3)), r"shape \(16, 21, 3\), but must have the shape of the renderer's .*, \(16, 20, 3\)\.$"),
         (np.full((16, 20, 3), np.nan), r"not finite, but must be made of finite numbers\.$"),
         (np.full((16, 20, 3), 200.0), f"a value of 200, {light} that of cortado"),
         (np.ones((16, 20, 3), np.uint8), f"made of whole numbers, {light}"),

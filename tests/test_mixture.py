@@ -162,7 +162,7 @@ def test_free_energies_of_one_name_are_told_from_one_another():
         ({"curvature": -1.0}, "FreeEnergy quartic's curvature is -1.0, but must be at least 0"),
         ({"functions": lambda precision: 3}, r"takes the arguments '\(precision\)', but must take 2: a precision"),
         ({"value": 3}, "FreeEnergy quartic's value is 3, but must be a function"),
-        ({"name": 3}, "FreeEnergy has the name 3, but must have a text"),
+        ({"name": 3}, "FreeEnergy has the name 3, but the name must be a text"),
     ],
 )
 def test_what_is_no_free_energy_is_a_sentence(changes, said):

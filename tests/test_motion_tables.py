@@ -275,7 +275,7 @@ def test_saved_runs_know_their_files_again(tmp_path):
         folder.require_files()
         with open(changed, "a") as more:
             more.write("\n2,2,-1" if changed == sway else "\n2,2")
-        with pytest.raises(InputError, match=r"\.csv has changed since the run in .* put the former file back"):
+        with pytest.raises(InputError, match=r"\.csv has changed since the run in .* restore the former file"):
             folder.require_files()
 
 

@@ -75,7 +75,7 @@ def number(name, value=1.0):
     ("forces", "said"),
     [
         (Breeze(), "forces is <.*>, but must be a list of forces, such as"),
-        ([Breeze], r"forces has <class .*> at place 0, but each must be an object with a method force\(setting\)"),
+        ([Breeze], r"forces has <class .*> at place 0, but each force must be an object with a method force"),
         ([Named("k")], r"has parameters \['k'\], but must have a list of"),
         ([Breeze(), Breeze()], "parameter breeze.k of a force has the name of another one, breeze.k, but must have"),
         ([Named(number("a.b")), Named(number("a_b"))], "parameter a_b of a force has the name of another one, a.b"),
@@ -126,9 +126,9 @@ def test_a_part_without_derivatives_says_so():
     simulation = Simulation(plane(), forces=[Made(Forward)])
     simulation.run(2)
     judged = Problem(simulation, 2, cortado.losses.FinalPositions(simulation.positions))
-    with pytest.raises(MissingDerivativeError, match="Forward has no reverse mode: let it have a method new_adjoint"):
+    with pytest.raises(MissingDerivativeError, match="Forward has no reverse mode: define the method new_adjoint"):
         judged.value_and_gradient({"memory.k": 1.0})
-    with pytest.raises(MissingDerivativeError, match="Forward has no forward mode: let it have a method new_tangent"):
+    with pytest.raises(MissingDerivativeError, match="Forward has no forward mode: define the method new_tangent"):
         judged.tangent({"memory.k": 1.0}, {"memory.k": 1.0})
 
 
@@ -152,9 +152,9 @@ def field(entry, first, *axis):
     ("force", "error", "message"),
     [
         (of_fields(U, U), TypeError, "several fields called 'remembered_velocities'"),
-        (of_fields(field(Entry.NUMBER, "weight")), TypeError, "'u' begins as 'weight', but must begin as one of"),
-        (of_fields(field(Entry.NUMBER, "initial_velocities")), TypeError, "which is not a number of each particle"),
-        (of_fields(field(Entry.VECTOR, "viscosity", Axis.SCALAR)), TypeError, "which is not a vector of the scene"),
+        (of_fields(field(Entry.NUMBER, "weight")), TypeError, "'u' begins as 'weight', but must begin as a parameter"),
+        (of_fields(field(Entry.NUMBER, "initial_velocities")), TypeError, "which is not a number for each particle"),
+        (of_fields(field(Entry.VECTOR, "viscosity", Axis.SCALAR)), TypeError, "which is not a vector for the scene"),
         (lambda setting: object(), InputError, r"object, which .*Made.* made, has no shares, but must have"),
         (Duck, InputError, "the force Duck has the methods settle of a part, but is no Part"),
         (type("Idle", (MemoryForce,), {"end": Part.end}), InputError, "Idle has fields, but no method `end` that"),

@@ -61,7 +61,7 @@ def test_a_rollout_takes_derivatives_of_its_own_alone():
     simulation = Simulation(plane())
     rollout, other = simulation.rollout(3), simulation.rollout(3)
     rollout.forward(keep=False)
-    with pytest.raises(InputError, match="run forward first, with keep=True"):
+    with pytest.raises(InputError, match="call forward with keep=True first"):
         rollout.backward(Exact().derivative(rollout), {})
     with pytest.raises(InputError, match="was made for another rollout"):
         rollout.backward(Exact().derivative(other), {})
@@ -158,7 +158,7 @@ def test_gravity_adds_to_its_adjoint():
 
 @pytest.mark.parametrize("shares", ["drag", "gravity", "mass_fractions"])
 def test_what_cannot_be_shared_is_said(shares):
-    with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of some of rest_density, "):
+    with pytest.raises(TypeError, match=f"shares has '{shares}', but must be a tuple of names among rest_density, "):
         Shares([shares], Layout(3, 1, FLOAT64, "cpu"))
 
 

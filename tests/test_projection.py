@@ -140,7 +140,7 @@ def test_water_rests_between_solids_that_stand_on_the_floor_of_a_box():
 
 def test_more_images_than_have_numbers_are_refused(monkeypatch):
     monkeypatch.setattr("cortado.particles.mirrors.NUMBERS", 99 * 64 + 1)
-    with pytest.raises(InputError, match="100 particles are too many beside walls that mirror them: at most 99"):
+    with pytest.raises(InputError, match="100 particles are too many for mirroring walls: take at most 99"):
         Simulation(resting())
 
 
@@ -198,7 +198,7 @@ def test_derivatives_are_those_of_as_many_iterations_as_a_step_took():
 def test_tolerances_that_mean_nothing_are_a_sentence(solver, words):
     with pytest.raises(SceneError, match=words):
         plane(solver={**SOLVER, **solver})
-    with pytest.raises(InputError, match=r"batch is 2, .* as solver\.tolerance is that of one scene"):
+    with pytest.raises(InputError, match=r"batch is 2, .* as solver\.tolerance applies to a single scene"):
         Simulation(plane(solver=MET), batch=2)
 
 

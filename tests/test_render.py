@@ -370,7 +370,7 @@ def rendered(**values: Any) -> Renderer:
 def test_wrong_input_is_a_sentence():
     for make, sentence in [
         (lambda: camera(look_at=(0, 1, 0)), "look_at is .* must not be the position"),
-        (lambda: camera(up=(0, 2, 0)), "up is .* along the view"),
+        (lambda: camera(up=(0, 2, 0)), "up is .* parallel to the view"),
         (lambda: camera(position=(0, 1)), "position is .* must be 3 finite numbers"),
         (lambda: camera(field_of_view=180.0), "field_of_view is 180.0, but must be between 0 and 180"),
         (lambda: camera(resolution=(0, 4)), "resolution is .* positive whole numbers"),

@@ -152,7 +152,7 @@ def turned(viscosity, shear_rate):
 def test_laws_of_one_s_own_that_do_not_fit_are_sentences():
     own, other = Rheology(cross, time=0.4, index=0.8), Rheology(cross, "other", time=0.1, index=0.5)
     pairwise = thick(forces={"gravity": [0.0, 0.0], "viscosity": "pairwise"})
-    bingham, words = thick({"kind": "bingham", **KINDS["bingham"]}), r"^Rheology\(.*\) and Rheology\(.*\) both take the"
+    bingham, words = thick({"kind": "bingham", **KINDS["bingham"]}), r"^Rheology\(.*\) and Rheology\(.*\) both replace"
     steep = {**HONEY, "viscosity": 1e28, "rheology": {"kind": "power_law", "flow_index": 3.0}}
     for make, said in (
         (lambda: Simulation(pairwise, forces=[own]), "viscosity is 'pairwise', but must be 'stress'"),
@@ -203,8 +203,8 @@ BENT = {"swirl": [0.1, 0.2], "slope": OverTime([0.0, 1.0], [0.0, 0.0])}
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"beyond.slope": 1e-4}, r"beyond returns -\d.* at a shear rate of 1\.\d*e\+04 1/s, for the viscosity of h"),
-        ({"viscosity": 1e-9, "beyond.slope": 1e-9}, r"beyond returns -\d.* for the viscosity of honey, 1e-09 Pa s"),
+        ({"beyond.slope": 1e-4}, r"beyond returns -\d.* at a shear rate of 1\.\d*e\+04 1/s for h"),
+        ({"viscosity": 1e-9, "beyond.slope": 1e-9}, r"beyond returns -\d.* for honey with the viscosity 1e-09 Pa s"),
         ({"swirled.swirl": [-2.0, 0.0]}, "swirled returns -0.5 Pa s"),
         ({"swirled.slope": np.array([0.0] * 4 + [1e3] * 4)}, r"swirled returns -\d"),
     ],

@@ -103,7 +103,7 @@ def test_a_folder_of_several_runs_or_of_the_user_is_refused(tmp_path, monkeypatc
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     for path in (".", "", "..", tmp_path):
-        with pytest.raises(InputError, match="is the current folder, or contains it; choose another --out"):
+        with pytest.raises(InputError, match="is or contains the current folder; choose another --out"):
             new_run(path)
     assert sorted(os.listdir(tmp_path)) == ["runs", "work"] and not os.listdir(tmp_path / "work")
 
@@ -339,7 +339,7 @@ def test_a_mesh_that_has_changed_since_is_told_of(tmp_path):
     folder = RunFolder.create(tmp_path / "run", made, COMMAND)
     folder.require_files()
     mesh.write_bytes(b"a cube")
-    with pytest.raises(InputError, match=r"ball.stl has changed since the run in .* put the former file back"):
+    with pytest.raises(InputError, match=r"ball.stl has changed since the run in .* restore the former file"):
         folder.require_files()
     with pytest.raises(InputError, match="has changed"):
         RunFolder.resume(folder.path, made, COMMAND)

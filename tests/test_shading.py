@@ -312,7 +312,7 @@ def test_a_film_has_as_many_frames_as_are_asked_for_and_says_what_is_left_out():
     asked = Pace.of(times, speed=1.0)
     assert len(asked.frames) == 51 and asked.times[-1] == 2.0 and "350 of the 401" in str(asked)
     assert REAL_TIME not in str(asked) and REAL_TIME not in str(Pace.of(times, speed=0.5))
-    with pytest.warns(CortadoWarning, match=r"the film has 7 frames of the 90 that picture.film_frames asks for"):
+    with pytest.warns(CortadoWarning, match=r"the film has 7 frames instead of the 90 of picture.film_frames"):
         assert len(pace_of(np.arange(7.0), Picture(film_frames=90)).frames) == 7
 
 

@@ -211,7 +211,7 @@ class Uncounted(Falling):
         (Wrong(None, "k"), {}, "the solver <.*> has parameters 'k', but must have a list"),
         (Wrong(None, [number("gravity")]), {}, "parameter gravity of a solver has the name of another one"),
         (MakeRemembering(np.nan), {}, "parameter memory.rate has a value that is not finite"),
-        (MakeFalling(), {"batch": 2}, "batch is 2, but must be left out, as the solver MakeFalling has no batches"),
+        (MakeFalling(), {"batch": 2}, "batch is 2, but must be left out, as .* MakeFalling supports no batches"),
         (Makes(ParticleSolver), {}, "build of the solver Makes returned .*, which has no step, but must have one"),
         (Makes(Uncounted), {}, r"solver Uncounted does not count its steps: .* self\.end_step"),
         (Wrong(Alone()), {"forces": [Breeze()]}, "forces is given, but must be left out, as the solver Wrong takes no"),

@@ -45,11 +45,11 @@ def other_walls(x_ij: vector, strength: real) -> real:
 @pytest.mark.parametrize(
     ("make", "term", "message"),
     [
-        (fluid_sum(D), untyped, "term untyped has no type at 'c_j', but must have a type at each."),
-        (fluid_sum(D), matrix, "but a sum must be of numbers or vectors of the precision."),
-        (wall_sum(D), apart, "term apart has no x_ij, but must have it where it is summed over walls."),
+        (fluid_sum(D), untyped, "term untyped has no type for 'c_j', but must have a type for each parameter."),
+        (fluid_sum(D), matrix, "but must return numbers or vectors of the precision."),
+        (wall_sum(D), apart, "term apart has no x_ij, but needs x_ij for a sum over walls."),
         (pair_sum(D, walls=other_walls), matrix, "term other_walls of walls has strength, but must have"),
-        (lambda f: made_adjoint(D, lambda d: f), apart, "term apart has no x_ij, but must have it for derivatives"),
+        (lambda f: made_adjoint(D, lambda d: f), apart, "term apart has no x_ij, but needs x_ij for derivatives"),
     ],
 )
 def test_what_a_term_cannot_be_is_said(make, term, message):

@@ -309,7 +309,7 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
     simulation, still = Simulation(drop(CHOSEN)), {"gravity": [0.0, 0.0], "viscosity": "none"}
     held = "time_step is given, but must be left out, as the scene chooses its time steps, .* hold them constant"
     series = cortado.losses.Series(PressureProbe([0.3, 0.1]), [0.0, 0.1], [0.0, 1.0], 0.001)
-    path, one_place = {"nozzle.path": np.tile(jet().emitter[0].outlet, (3, 1))}, "one place where time steps are chosen"
+    path, one_place = {"nozzle.path": np.tile(jet().emitter[0].outlet, (3, 1))}, "one place if time steps are adaptive"
     for call, what in [
         (lambda: simulation.run(3, {"time_step": 0.001}), held),
         (lambda: simulation.jvp(simulation.state(), {}, {}, {"time_step": 1.0}), held),
@@ -398,7 +398,9 @@ def test_a_run_with_parameters_that_shorten_its_steps_reaches_its_time():
 
 def test_a_bound_that_float32_does_not_hold_is_refused():
     scene = drop({**CHOSEN, "greatest_time_step": 1e-20})
-    with pytest.raises(InputError, match="chosen as 1e-20 s at most, but must be at least 1e-12 s in this precision"):
+    with pytest.raises(
+        InputError, match="time step is at most 1e-20 s, but must be at least 1e-12 s in this precision"
+    ):
         Simulation(scene).run(3)
     assert Simulation(scene, precision="float64").run(3).times[-1] == pytest.approx(3e-20, rel=1e-12)
 

@@ -185,14 +185,14 @@ def certify(
     if not isinstance(problem, Problem):
         if steps is None:
             found = type(problem).__name__
-            raise InputError(f"steps is left out, but must be given to certify a {found}, which is not a Problem.")
+            raise InputError(f"steps is left out, but must be given, as a {found} has no number of steps.")
         simulation = problem if isinstance(problem, Simulation) else Simulation(problem, precision="float64")
         problem = Problem(simulation, steps, FinalPositions(simulation.positions))
     elif steps is not None:
         own = f"as the problem has {problem.steps} steps"
         raise InputError(f"steps is {shown(steps)}, but must be left out, {own}.")
     if problem.simulation.batch is not None:
-        raise InputError("problem is of a batch, but must be of one scene, as all scenes have the same derivatives.")
+        raise InputError("problem has a batch of scenes, but must have a single scene: certify one scene of the batch.")
     problem.simulation.scene.solver.fixed_time_step("a certificate, whose differences would not hold chosen ones")
     double = in_float64(problem)
     chosen = checked_parameters(double, parameters)

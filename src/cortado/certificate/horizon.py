@@ -24,8 +24,8 @@ spacing, and velocities relative to the speed of a fall over the fluid's height.
 def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> Arrays:
     simulation = problem.simulation
     if problem.state is not None:
-        said = "problem begins at a state, but must begin as its scene does"
-        raise InputError(f"{said}, as certificates vary first positions and velocities, too.")
+        said = "problem begins at a given state, but must begin at the scene's initial state"
+        raise InputError(f"{said}, as certificates also vary initial positions and velocities.")
     values = ParameterSpace(simulation, problem.steps).defaults()
     for view, other in simulation.known.views.items():
         parameter = simulation.known[view]
@@ -45,7 +45,9 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
     found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
     for name, value in found.items():
         if not _moves_both_ways(simulation.known[name], value):
-            raise InputError(f"parameter {name} is 0, but must be greater than 0, so that it can be moved both ways.")
+            raise InputError(
+                f"parameter {name} is 0, but must be greater than 0: certify increases and decreases {name}."
+            )
     return found
 
 

@@ -51,7 +51,7 @@ class Ensemble:
 
     def __post_init__(self) -> None:
         if not is_whole(self.samples) or self.samples < 2:
-            raise InputError(f"samples is {shown(self.samples)}, but must be at least 2, to know how they scatter.")
+            raise InputError(f"samples is {shown(self.samples)}, but must be at least 2: one sample has no scatter.")
         require_at_most("samples", self.samples, MOST_SAMPLES)
         position_noise = as_number(self.position_noise)
         if position_noise is None or position_noise < 0.0:
@@ -67,13 +67,13 @@ class Ensemble:
     def around(self, problem: Differentiable, parameters: Values, draw: int = 0) -> "Sampler":
         """Return the ensemble around the parameters. Different numbers ``draw`` give independent samples."""
         if problem.simulation.batch is not None:
-            said = f"{type(self).__name__} is given a problem of a batch, but must be given one of a single scene"
-            raise InputError(f"{said}, whose samples it runs in batches of its own.")
+            said = f"{type(self).__name__} is given a problem with a batch of scenes, but needs a single scene"
+            raise InputError(f"{said}: the estimator makes its own batches of samples.")
         if not parameters:
             raise InputError(f"parameters is empty, but must name the parameters that {type(self).__name__} varies.")
         values = {name: as_numbers(f"parameter {name}", value) for name, value in parameters.items()}
         if lacking := [name for name in values if isinstance(self.spread, Mapping) and name not in self.spread]:
-            raise InputError(f"spread has nothing for {lacking[0]}, but must have a number for every parameter.")
+            raise InputError(f"spread has no number for {lacking[0]}, but must have a number for every parameter.")
         given = self.spread if isinstance(self.spread, Mapping) else dict.fromkeys(values, self.spread)
         widths, precision = {name: float(given[name]) for name in values}, problem.simulation.precision
         for name, value in values.items():
@@ -153,13 +153,13 @@ def remaining(runs: Sequence[Estimate], members: int, what: str) -> np.ndarray:
     if not out:
         return kept
     present = [error for error in errors if error is not None]
-    said = f"{without_runs(present, f'{lost.size} runs of the ensemble')}, by which {out} of {len(kept)} {what}"
+    said = f"{without_runs(present, f'{lost.size} runs of the ensemble')}, so that {out} of {len(kept)} {what}"
     if out > MOST_LEFT_OUT * len(kept):
-        preface = f"{said} cannot be averaged, but at most a quarter may be left out: {ADVICE}. The first:"
+        preface = f"{said} cannot be averaged, but at most a quarter may be left out: {ADVICE}. The first error:"
         if isinstance(present[0], DivergedError):
             raise present[0].among_others(preface)
         raise OutOfRangeError(f"{preface} {present[0]}")
-    warn(f"{said} are left out of the average. The first: {present[0]}", LeftOutWarning)
+    warn(f"{said} are left out of the average. The first error: {present[0]}", LeftOutWarning)
     return kept
 
 
@@ -198,9 +198,9 @@ class RandomizedSmoothing(Ensemble):
         ensemble = self.around(problem, parameters)
         numbers = len(ensemble.spreads)
         if numbers > MOST_NUMBERS:
-            said = f"the parameters are {numbers} numbers, but must be at most {MOST_NUMBERS}"
-            advice = "take fewer, such as one gravity for all steps, or another estimator"
-            raise InputError(f"{said}, as the simulation is run twice for each: {advice}.")
+            said = f"the parameters have {numbers} components, but must have at most {MOST_NUMBERS}"
+            advice = "take fewer components, such as one gravity for all steps, or another estimator"
+            raise InputError(f"{said}, as each component takes two runs: {advice}.")
         self.require_memory(2 * numbers * self.samples, numbers)
         directions, r = [], np.sqrt(numbers)
 

@@ -46,7 +46,7 @@ class Estimate:
             InputError: the estimate is not an average, or the confidence is not between 0 and 1.
         """
         if self.standard_error is None or self.degrees_of_freedom is None:
-            raise InputError("The estimate has no confidence interval, as it is no average over samples.")
+            raise InputError("The estimate has no confidence interval, as the estimate is not an average over samples.")
         if not 0.0 < as_one_number("confidence", confidence) < 1.0:
             raise InputError(f"confidence is {confidence}, but must be between 0 and 1.")
         from scipy.stats import t as student
@@ -138,7 +138,7 @@ def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -
         gradient[name] = as_numbers(what, found.gradient[name])
         wanted = np.shape(given) if batch is None else (batch, *gradient[name].shape[1:])
         if gradient[name].shape != wanted:
-            raise InputError(f"{what} has shape {gradient[name].shape}, but must be {wanted}, the parameter's.")
+            raise InputError(f"{what} has shape {gradient[name].shape}, but must have the parameter's shape {wanted}.")
     return replace(found, loss=loss, gradient=gradient)
 
 
@@ -217,7 +217,7 @@ class Point:
             return self.without_a_run(error)
         except InputError as error:
             if self.is_sample:
-                raise InputError(f"A sample of the ensemble does not fit: {error}") from error
+                raise InputError(f"A sample of the ensemble is invalid: {error}") from error
             raise
 
     def without_a_run(self, why: Exception) -> Estimate:

@@ -56,7 +56,9 @@ class FinalPositions:
         """Set the ``target`` positions (n, d) [m], in the order of the initial particles."""
         self.target = read_only("target", target)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
-            raise InputError(f"target has shape {self.target.shape}, but must be (particles, dimension) and finite.")
+            raise InputError(
+                f"target has shape {self.target.shape}, but must be a finite array (particles, dimension)."
+            )
         self.fingerprint = _checksum(self.target)
         self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}
 
@@ -144,7 +146,7 @@ class CentreOfMassAlong:
 def _finite(what: str, value: Any) -> np.ndarray:
     array = read_only(what, value)
     if array.ndim != 1 or not np.isfinite(array).all():
-        raise InputError(f"{what} has shape {array.shape}, but must have 1 dimension and be finite.")
+        raise InputError(f"{what} has shape {array.shape}, but must be a finite array with 1 axis.")
     return array
 
 
@@ -153,7 +155,9 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
         return None
     array = _finite("masses", masses)
     if not (array >= 0.0).all() or not array.any():
-        raise InputError("masses has a number below 0, or only zeros, but must be the masses of particles.")
+        raise InputError(
+            "masses has a number below 0, or only zeros, but must be numbers of at least 0 with a sum above 0."
+        )
     return array
 
 
@@ -204,8 +208,8 @@ class SolidPose:
     def value_and_adjoint(self, end: Snapshot) -> tuple[float, Adjoint]:
         name, names = self.name, end.state.names
         if position_name(name) not in names:
-            moving = ", ".join(solids_in(names)) or "none does"
-            raise InputError(f"name is {name!r}, but must be that of a solid that moves: {moving}.")
+            moving = ", ".join(solids_in(names)) or "the scene has none"
+            raise InputError(f"name is {name!r}, but must be the name of a moving solid: {moving}.")
         value, bars = 0.0, {}
         if self.position is not None:
             position = end[position_name(name)]
@@ -257,7 +261,7 @@ class Image:
             raise InputError(f"target has shape {self.target.shape}, but must be a picture (rows, columns, 3).")
         if shape is not None and self.target.shape != shape:
             found = f"target has shape {self.target.shape}"
-            raise InputError(f"{found}, but must have that of the renderer's pictures, {shape}.")
+            raise InputError(f"{found}, but must have the shape of the renderer's pictures, {shape}.")
         if not np.isfinite(self.target).all():
             raise InputError("target has a value that is not finite, but must be made of finite numbers.")
         check_light("target", target)
@@ -301,7 +305,7 @@ class SensorMatch:
         self.target = np.atleast_1d(read_only("target", target))
         divisors = as_numbers("scale", scale)
         if divisors.shape not in ((), self.target.shape) or not ((divisors > 0.0) & (divisors < np.inf)).all():
-            wanted = f"a number greater than 0, or {len(self.target)} of them, one for each column"
+            wanted = f"a number greater than 0, or {len(self.target)} such numbers, one for each column"
             raise InputError(f"scale is {shown(scale)}, but must be {wanted}.")
         self.scale = np.broadcast_to(divisors, self.target.shape)
         arrays = self.target.tobytes() + self.scale.tobytes()
@@ -318,7 +322,7 @@ class SensorMatch:
         if found.shape != self.target.shape:
             columns = ", ".join(self.sensor.columns(end.dimension))
             said = f"values has {len(self.target)} columns"
-            raise InputError(f"{said}, but must have {len(found)}, those of the sensor: {columns}.")
+            raise InputError(f"{said}, but must have the {len(found)} columns of the sensor: {columns}.")
         return np.where(np.isnan(self.target), 0.0, found - self.target) / self.scale
 
 
@@ -342,15 +346,17 @@ class Series(Frames):
         moments, series = read_only("times", times), as_numbers("values", values)
         series = series[:, None] if series.ndim == 1 else series
         if moments.ndim != 1 or len(moments) < 2 or not (np.diff(moments) > 0.0).all():
-            raise InputError("times must be a list of at least two rising numbers.")
+            raise InputError("times must be a list of at least two increasing numbers.")
         if series.ndim != 2 or len(series) != len(moments):
             raise InputError(f"values has shape {series.shape}, but must have {len(moments)} rows, one for each time.")
         if np.isinf(series).any() or np.isnan(series).all():
-            raise InputError("values must be finite, or NaN for values to ignore, but not all NaN.")
+            raise InputError("values must be finite, or NaN where nothing was measured, and must not all be NaN.")
         columns, sizes = series.shape[1], as_numbers("scale", scale)
         if sizes.shape not in ((), (columns,)):
             said = f"scale has shape {sizes.shape}"
-            raise InputError(f"{said}, but must be a number or ({columns},), one for each column.")
+            raise InputError(
+                f"{said}, but must be one number, or have shape ({columns},) with a number for each column."
+            )
         if not (sizes > 0.0).all():
             raise InputError("scale must be greater than 0.")
         step, stride = as_one_number("time_step", time_step), whole_number("every", every, 1)
@@ -359,7 +365,9 @@ class Series(Frames):
         first, last = int(np.ceil(moments[0] / step - 1e-9)), int(np.floor(moments[-1] / step + 1e-9))
         steps = [k for k in range(max(first, 0), last + 1) if k % stride == 0]
         if not steps:
-            raise InputError(f"times go from {moments[0]:g} to {moments[-1]:g} s, between which no step ends.")
+            raise InputError(
+                f"times go from {moments[0]:g} to {moments[-1]:g} s, but no step ends between these times."
+            )
         rows = np.stack([np.interp(np.array(steps) * step, moments, column) for column in series.T], axis=1)
         weight = 1.0 / len(steps)
         self.time_step = step
@@ -369,4 +377,6 @@ class Series(Frames):
         other = time_steps[np.abs(time_steps - self.time_step) > 1e-6 * time_steps]  # rounded to float32
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"
-            raise InputError(f"{found}, but must be that of the run, {other[0]:g} s: a series has a fixed time step.")
+            raise InputError(
+                f"{found}, but must be the time step of the run, {other[0]:g} s: a series has a fixed time step."
+            )

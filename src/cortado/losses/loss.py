@@ -108,7 +108,7 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 
 def moment_of(end: "Snapshot | SnapshotBatch") -> Moment:
     if end.moment is None:
-        raise InputError("The state has no simulation, with which quantities are computed: take a state of a run.")
+        raise InputError("The state has no simulation that could compute quantities: take a state of a run.")
     return end.moment
 
 
@@ -214,7 +214,7 @@ class Frames:
             raise InputError(f"losses is {shown(losses)}, but must be a table with a loss for at least one frame.")
         for step in losses:
             if not is_whole(step) and not (isinstance(step, float) and float(step).is_integer()):
-                raise InputError(f"losses has the frame {shown(step)}, but must have whole numbers of steps.")
+                raise InputError(f"losses has the frame {shown(step)}, but frames must be whole numbers of steps.")
         self.losses = FixedDict(losses)
 
     def check(self, time_steps: np.ndarray) -> None:

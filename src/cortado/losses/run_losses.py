@@ -154,7 +154,7 @@ def as_loss(loss: Any) -> CheckedLoss:
             require_arguments(f"the loss's {name}", getattr(loss, name), ("the end of a trajectory",))
         return CheckedBatchedLoss(loss) if isinstance(loss, BatchedLoss) else CheckedLoss(loss)
     if not callable(loss):
-        raise InputError(f"loss is a {type(loss).__name__}, but must have a value and an adjoint, or be a function.")
+        raise InputError(f"loss is a {type(loss).__name__}, but must be a function, or have methods value and adjoint.")
     other = ", of Warp arrays; a loss of the end of a trajectory is an object with value(end) and adjoint(end)"
     require_arguments("loss", loss, LAUNCHED, other)
     return CheckedLoss(Recorded(loss))
@@ -190,7 +190,9 @@ def _checked_share(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray
     array = _checked_array(what, values, shape)
     if not np.isfinite(array).all():
         row = np.argwhere(~np.isfinite(array))[0][0]
-        raise InputError(f"the loss's {what} has a value in row {row} that is not finite, but must be made of numbers.")
+        raise InputError(
+            f"the loss's {what} has a value in row {row} that is not finite, but all values must be finite."
+        )
     return array
 
 
@@ -202,8 +204,10 @@ class LossesByStep(dict[int, CheckedLoss]):
     def __init__(self, loss: Any, steps: int, chosen: bool = False):
         """``loss`` reads the last state, or is a `Frames`. ``chosen`` is true if the run chooses its time steps."""
         if chosen and getattr(loss, "time_step", None) is not None:
-            wanted = 'one of numbers of steps, as solver.time_step is "auto"'
-            raise InputError(f"loss is a {type(loss).__name__} of steps of {loss.time_step:g} s, but must be {wanted}.")
+            wanted = 'a loss without a time step, as solver.time_step is "auto"'
+            raise InputError(
+                f"loss is a {type(loss).__name__} with a time step of {loss.time_step:g} s, but must be {wanted}."
+            )
         by_step = loss.losses if isinstance(loss, Frames) else {steps: loss}
         for step in by_step:
             if step not in range(steps + 1):

@@ -55,7 +55,9 @@ def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
         for types in (term.arrays, term.others)
     )
     if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
-        raise TypeError(f"term {term.name} has a name and the same with _dot, but tangents have such names.")
+        raise TypeError(
+            f"term {term.name} has the names x and x_dot, but only the tangent of x may have the name x_dot."
+        )
     kinds, real = {**term.parameters, **bars_of(term)}, d.precision.real
     moved = [name for name in term.parameters if name not in ("i", "j", "s")]
 
@@ -82,7 +84,7 @@ def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
 def _differentiable(make: TermMaker, d: Discretisation) -> Term:
     term = Term.of(make(replace(d, taped=True)))
     if "x_ij" not in term.parameters:
-        raise TypeError(f"term {term.name} has no x_ij, but must have it for derivatives to be made of it.")
+        raise TypeError(f"term {term.name} has no x_ij, but needs x_ij for derivatives by Warp.")
     return term
 
 

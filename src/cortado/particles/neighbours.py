@@ -314,8 +314,8 @@ class NeighbourSearch:
         precision, device, particles = discretisation.precision, layout.device, layout.all_particles
         if mirrored and particles > (most := most_imaged(discretisation.moving)):
             raise InputError(
-                f"{particles:,} particles are too many beside walls that mirror them: at most {most:,}, or any "
-                'number with container.slip = "no".'
+                f"{particles:,} particles are too many for mirroring walls: take at most {most:,} particles, or "
+                'container.slip = "no" for any number.'
             )
         self.particles, self.device = particles, device
         self._fill, self._fill_images = fill_kernel(discretisation), image_kernel(discretisation)

@@ -59,9 +59,13 @@ class Term:
         for name in names:
             if name not in types or isinstance(types[name], str):
                 found = "a text" if name in types else "no type"
-                raise TypeError(f"term {function.__name__} has {found} at {name!r}, but must have a type at each.")
+                raise TypeError(
+                    f"term {function.__name__} has {found} for {name!r}, but must have a type for each parameter."
+                )
             if name.startswith("_"):
-                raise TypeError(f"term {function.__name__} has {name!r}, but names must not begin with an underscore.")
+                raise TypeError(
+                    f"term {function.__name__} has the parameter {name!r}, but names must not begin with an underscore."
+                )
         result = types.pop("return")
         return cls(function, types, get_args(result) or (result,))
 
@@ -181,7 +185,7 @@ def over_images(d: Discretisation, arrays: Types, body: Body) -> str:
 
 def over_walls(wall: Term, d: Discretisation, grows: Any, weight: str) -> str:
     if "x_ij" not in wall.parameters:
-        raise TypeError(f"term {wall.name} has no x_ij, but must have it where it is summed over walls.")
+        raise TypeError(f"term {wall.name} has no x_ij, but needs x_ij for a sum over walls.")
     arrays = wall.of_neighbours
     of_b = {array: zero(kind, d) for array, kind in arrays.items()}
     of_b |= {array: text for array, text in MOVING.items() if d.moving and array in arrays} | {"x": PLACE}
@@ -201,7 +205,7 @@ def summed(
     """Make the Warp function ``name(i, *arrays, *others, s)``, which runs ``loops`` and returns the sums."""
     for kind in results:
         if kind is not d.precision.real and not _is_vector_of(d.precision.real, kind):
-            raise TypeError(f"{name} returns {kind}, but a sum must be of numbers or vectors of the precision.")
+            raise TypeError(f"{name} returns {kind}, but must return numbers or vectors of the precision.")
     begin = [f"{own_entry(array)} = {array}[i]" for array in arrays if re.search(rf"\b{own_entry(array)}\b", loops)]
     begin += [f"_total_{n} = {zero(kind, d)}" for n, kind in enumerate(results)]
     text = SUM.format(
@@ -281,7 +285,9 @@ def pair_sum(
         more = [name for name, kind in (wall.arrays | wall.others).items() if own.get(name) != kind]
         if wall.results != term.results or more:
             found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
-            raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
+            raise TypeError(
+                f"term {wall.name} of walls {found}, but must have the results and parameters of {term.name}."
+            )
         return over_fluid(term, d, ahead) + over_walls(wall, d, grows, RUBBING if rubs else ALL)
 
     return _summing(d, typed, loops, walls, grows=grows)

@@ -60,7 +60,8 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
             continue
         if field.first not in known:
             raise TypeError(
-                f"field {field.name!r} begins as {field.first!r}, but must begin as one of {', '.join(known)}, or at 0."
+                f"field {field.name!r} begins as {field.first!r}, but must begin as a parameter, "
+                f"{', '.join(known)}, or at 0."
             )
         particles, dimension, phases = 7, 2, 5  # any that differ
         (shape, *_) = known[field.first].shapes(0, phases, (particles, dimension))
@@ -69,7 +70,7 @@ def check_fields(fields: Iterable[StateField], known: Mapping[str, Parameter]) -
         if given != wanted:
             raise TypeError(
                 f"field {field.name!r} begins as {field.first!r}, which is not {field.entry.value} "
-                f"{'of each particle' if field.axis is Axis.PARTICLE else 'of the scene'}, but must be."
+                f"{'for each particle' if field.axis is Axis.PARTICLE else 'for the scene'}."
             )
 
 

@@ -55,14 +55,14 @@ class Camera:
         if not sight.any():
             raise InputError(f"look_at is {shown(self.look_at)}, but must not be the position of the camera.")
         if np.linalg.norm(np.cross(sight, self.up)) <= 1e-9 * np.linalg.norm(sight) * np.linalg.norm(self.up):
-            raise InputError(f"up is {shown(self.up)}, but must not be zero or along the view.")
+            raise InputError(f"up is {shown(self.up)}, but must not be zero or parallel to the view.")
         check_resolution(self.resolution)
         keep_own(self, "resolution")
         if self.far is None:
             object.__setattr__(self, "far", 2.0 * float(np.linalg.norm(sight)))
         near, far = as_one_number("near", self.near), as_one_number("far", self.far)
         if not 0 <= near < far < np.inf:
-            raise InputError(f"near is {shown(self.near)} and far {shown(self.far)}, but must be 0 <= near < far.")
+            raise InputError(f"near is {shown(self.near)} and far is {shown(self.far)}, but 0 <= near < far must hold.")
 
     @property
     def reach(self) -> float:
@@ -278,7 +278,7 @@ class Calibration:
     def __post_init__(self) -> None:
         for name in self.names:
             if name not in self._values:
-                raise InputError(f"calibrate has {shown(name)}, but must be made of {', '.join(self._values)}.")
+                raise InputError(f"calibrate has {shown(name)}, but must have names among {', '.join(self._values)}.")
 
     @property
     def start(self) -> dict[str, np.ndarray]:

@@ -230,7 +230,7 @@ def nodes_over(
     counts = np.ceil((upper - lower) / cell * (1 - 1e-12)) + 2 * margin + 1
     if np.prod(counts) > MOST_NODES:
         found = f"cell is {cell:g}, which makes {np.prod(counts):.1e} nodes"
-        raise InputError(f"{found}; {MOST_NODES} at most, take a larger.")
+        raise InputError(f"{found}, but at most {MOST_NODES} nodes are possible: take a larger cell.")
     flat = 3 - len(lower)
     nodes = nodes_type(precision)()
     nodes.origin = precision.vector_of(lower - margin * cell)

@@ -165,11 +165,13 @@ class Renderer:
         if fractions is None:
             if self._phases > 1:
                 wanted = f"mass fractions ({self._particles}, {self._phases})"
-                raise InputError(f"fractions is left out, but must be {wanted}, as there are {self._phases} phases.")
+                raise InputError(
+                    f"fractions is left out, but must be {wanted}, as the fluid has {self._phases} phases."
+                )
             fractions = np.ones((self._particles, 1))
         colours = self._colours if colours is None else colours
         if colours is None:
-            raise InputError("colours is left out, but must be given, as the renderer was made without any.")
+            raise InputError("colours is left out, but must be given, as the renderer has no default colours.")
         x = self._on_device("positions", positions, self._dimension, self._precision.vector)
         c = self._on_device("fractions", fractions, self._phases, self._precision.fractions(self._phases))
         colours = _of_shape("colours", colours, (self._phases, 3))

@@ -107,7 +107,7 @@ class HostStates:
         for scene in [array] if self._simulation.batch is None else array:
             lost = self._simulation.batch is not None and np.isnan(scene).all()
             if not lost and not np.isfinite(scene).all():
-                raise InputError(f"{what} has a value that is not finite, but must be numbers.")
+                raise InputError(f"{what} has a value that is not finite, but all values must be finite.")
 
     def read(self, state: State, lost: OfLost) -> dict[str, Any]:
         """Return derivatives by field name in float64. Derivatives of lost scenes are replaced by the values in
@@ -173,7 +173,7 @@ class DeviceState:
         return f"DeviceState({shapes}, {self.arrays.positions.device})"
 
     def __reduce__(self) -> NoReturn:
-        raise InputError("A state on the device can be neither pickled nor copied, but simulation.on_host(state) can.")
+        raise InputError("A state on the device cannot be pickled or copied: use simulation.on_host(state).")
 
 
 class DeviceStates(HostStates):
@@ -220,7 +220,9 @@ class DeviceStates(HostStates):
         vectors = {field.name for field in state.arrays.fields if field.entry is Entry.VECTOR}
         for name in vectors.intersection(given) if self._simulation.dimension == 2 else ():
             if state[name].numpy()[..., 2].any():
-                raise InputError(f"state {name} has a third component other than 0, but must have 0 there in 2-D.")
+                raise InputError(
+                    f"state {name} has a third component other than 0, but the third component must be 0 in 2-D."
+                )
         return state
 
     def on_host(self, state: DeviceState) -> States:
@@ -233,8 +235,8 @@ class DeviceStates(HostStates):
     def _require_taken(self, state: DeviceState) -> None:
         self._require_own(state)
         if not all(scene in self._simulation.judged_states for scene in set(state.scenes)):
-            advice = "simulation.on_host(state) is taken by any of the same scene"
-            raise InputError(f"state is of another simulation, but must be of this one: {advice}.")
+            advice = "any simulation of the same scene takes simulation.on_host(state)"
+            raise InputError(f"state is of another simulation, but must be of this simulation: {advice}.")
 
     def _require_own(self, state: DeviceState) -> None:
         own, found = self._simulation.initial, state.arrays
@@ -244,7 +246,7 @@ class DeviceStates(HostStates):
             for name in own.names
         ):
             raise InputError(
-                "state is of a simulation with other arrays, but must be of this one: the same scene, device, "
+                "state is of a simulation with other arrays, but must be of one with the same scene, device, "
                 "precision and batch."
             )
 
@@ -263,11 +265,13 @@ def _taken(what: str, value: Any) -> wp.array:
     if isinstance(value, wp.array):
         return value
     if not hasattr(value, "__dlpack__"):
-        raise InputError(f"{what} is {shown(value)}, but must be an array that speaks DLPack, such as a torch.Tensor.")
+        raise InputError(
+            f"{what} is {shown(value)}, but must be an array with the DLPack interface, such as a torch.Tensor."
+        )
     try:  # NumPy refuses DLPack for read-only arrays
         return wp.array(value, device="cpu") if isinstance(value, np.ndarray) else wp.from_dlpack(value)
     except (BufferError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{what} cannot be taken: {error}") from error
+        raise InputError(f"{what} cannot be read as a DLPack array: {error}") from error
 
 
 def _without_lost(lost: OfLost, state: State) -> State:

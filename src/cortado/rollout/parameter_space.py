@@ -207,7 +207,9 @@ class ParameterSpace:
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
         for name in self._known.state if states else ():
             if name in values:
-                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
+                raise InputError(
+                    f"parameter {name} is given, but must be left out, as the given state has initial values."
+                )
         simulation = self._simulation
         for state, own in zip(states, self.members(values), strict=False):
             origin = run_checks.origin_of(
@@ -282,7 +284,7 @@ class ParameterSpace:
         array = checked_value(name, value, [*own, *self._batched(own)], what, self._known)
         if len(own) == 2 and array.shape == own[1] and self._batch == self._steps > 1:
             rows, *rest = own[1]
-            found = f"has shape {array.shape}, which may be a row for each step or for each scene of the batch"
+            found = f"has shape {array.shape}, whose first axis may count the steps or the scenes of the batch"
             raise InputError(f"{what} {name} {found}, but must be {(1, rows, *rest)} or {(rows, 1, *rest)}.")
         return array
 
@@ -349,8 +351,8 @@ def steps_of_run(simulation: Simulated, steps: int | None, time: float | None, v
         shortest = float(sizes.min(initial=np.inf))
         return counted_steps(time, time / shortest * (1.0 - SAME)) if 0.0 < shortest < np.inf else 1
     if simulation.batch is not None:
-        said = "time is given, but must be left out of a batch with chosen time steps"
-        raise InputError(f"{said}, as its scenes reach a time in different steps: give steps.")
+        said = "time is given, but must be left out for a batch with adaptive time steps"
+        raise InputError(f"{said}, as the scenes need different numbers of steps: give steps.")
     # with 0 steps, because rows for steps have no meaning with an unknown number of steps
     own = SceneParameters(simulation, 0).upright(ParameterSpace(simulation, 0).checked(values))
     return ROOM * expected_steps(simulation, time, own)

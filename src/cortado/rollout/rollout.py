@@ -228,7 +228,7 @@ class Rollout(Staying):
         self._chunks[key]()
         if is_new and (self.solver.step_number.numpy() != last).any():  # then no lost particle would be noticed
             name = type(self.solver).__name__
-            raise InputError(f"solver {name} does not count its steps: its method step must end with self.end_step.")
+            raise InputError(f"solver {name} does not count its steps: the method step must end with self.end_step.")
         return self._chunk[:length]
 
     def _wait(self) -> None:
@@ -341,8 +341,8 @@ class Rollout(Staying):
 
     def _require(self, what: str, evaluation: int) -> None:
         if evaluation != self.evaluation:
-            lacking = "as it has not gone forward with these parameters, or has kept no states"
-            raise InputError(f"The rollout cannot go {what}, {lacking}: run forward first, with keep=True.")
+            lacking = "as no forward run with these parameters has kept its states"
+            raise InputError(f"The rollout cannot run {what}, {lacking}: call forward with keep=True first.")
 
     def _replayed(self, n: int, state: State) -> State:
         counts, new_state = self._seek(n), self.initial.following()

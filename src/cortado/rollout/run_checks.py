@@ -52,11 +52,11 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
         if room < 0.5 * (needed := free * spacing**scene.dimension):
             unit = "m2" if scene.dimension == 2 else "m3"
             found = f"parameter initial_positions has all particles within {room:.3g} {unit}"
-            raise InputError(f"{found}, but must leave them about the {needed:.3g} {unit} that their fluid fills.")
+            raise InputError(f"{found}, but the fluid of these particles fills about {needed:.3g} {unit}.")
     for emitter in scene.emitter:
         name = path_name(emitter.name)
         if scene.solver.chooses and np.ndim(values.get(name, 0.0)) == 2:
-            wanted = "one place where time steps are chosen: move the emitter by its table path"
+            wanted = "one place if time steps are adaptive: move the emitter by its table path"
             why = "whose times do not depend on the steps"
             raise InputError(f"parameter {name} has a row for each step, but must be {wanted}, {why}.")
         if name in values:
@@ -64,7 +64,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
             places = (path[:, None] + opening).reshape(-1, scene.dimension)
             for step in outside(scene.room, places, spacing)[:1] // len(opening):
                 found = f"parameter {name} is at {point_in_words(path[step])} m in step {step + 1}"
-                raise InputError(f"{found}, but must be where all of the opening is inside the container.")
+                raise InputError(f"{found}, but the whole opening must be inside the container.")
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
@@ -200,7 +200,7 @@ def one_for_each(state: RestartState | Sequence[RestartState] | None, batch: int
 
 def check_directions(along: Mapping[str, NDArray], of_state: Collection[str]) -> None:
     if given := [name for name in of_state if name in along]:
-        wanted = "but must be left out: give it among those of the state's fields"
+        wanted = "but must be left out: give the directions of the state's fields"
         raise InputError(f"direction {given[0]} is given, {wanted}.")
 
 
@@ -228,7 +228,7 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
         return
     for name, array in fields.items():
         if not np.isfinite(array).all():
-            raise InputError(f"state {name} has a value that is not finite, but must be numbers.")
+            raise InputError(f"state {name} has a value that is not finite, but all values must be finite.")
         if (size := np.abs(array).max(initial=0.0)) > simulation.precision.greatest:
             wanted = f"at most {simulation.precision.greatest:g} in {simulation.precision.name}"
             raise InputError(f"state {name} has a value of size {size:g}, but must be {wanted}.")
@@ -257,13 +257,13 @@ def check_state(state: RestartState, origin: Origin, simulation: Simulated) -> N
 
 def check_clock(clock: Clock) -> None:
     if not isinstance(clock, Clock):
-        raise InputError(f"state clock is {shown(clock)}, but must be a Clock, such as that of trajectory.last_state.")
+        raise InputError(f"state clock is {shown(clock)}, but must be a Clock, such as trajectory.last_state.clock.")
     if not is_whole(clock.steps) or clock.steps < 0:
         raise InputError(f"state clock has {shown(clock.steps)} steps, but must have a whole number of at least 0.")
     if not 0.0 <= as_one_number("state clock time", clock.time) < np.inf:
         raise InputError(f"state clock is at {shown(clock.time)} s, but must be at a finite time of at least 0 s.")
     if not 0.0 <= as_one_number("state clock time_step", clock.time_step) < np.inf:
-        raise InputError(f"state clock has a step of {shown(clock.time_step)} s, but must have a finite one, or 0.")
+        raise InputError(f"state clock has a step of {shown(clock.time_step)} s, but must have a finite step, or 0.")
 
 
 def _check_origin(found: Origin, wanted: Origin) -> None:
@@ -277,7 +277,7 @@ def _check_origin(found: Origin, wanted: Origin) -> None:
         if not is_same:
             own, needed = words.format(_listed(one)), words.format(_listed(other))
             why = f"as this simulation has{ADVICE.get(name, '')}"
-            raise InputError(f"state is of a run with {own}, but must be of one with {needed}, {why}.")
+            raise InputError(f"state is of a run with {own}, but must be of a run with {needed}, {why}.")
 
 
 WORDS = {
@@ -308,7 +308,7 @@ def _check_densities(found: NDArray, fractions: NDArray, rest_density: NDArray) 
     if (np.abs(measured - 1.0) > room).any() or not (between.all() or len(rest_density) == 1):
         lowest, highest = found.min(), found.max()
         values = f"{lowest:g}" if lowest == highest else f"from {lowest:g} to {highest:g}"
-        wanted = f"that of fluid with a rest density of {_listed(tuple(rest_density))} kg/m3, as this run has"
+        wanted = f"the density of fluid with a rest density of {_listed(tuple(rest_density))} kg/m3, as this run has"
         raise InputError(f"state reference_density is {values} kg/m3, but must be {wanted}{ADVICE['rest_density']}.")
 
 
@@ -319,8 +319,8 @@ def _check_spacing(positions: NDArray, simulation: Simulated) -> None:
     found, first = (nearest(x) / spacing for x in (positions, simulation.positions[: len(positions)]))
     usual, least = float(np.median(found)), float(np.quantile(found, 0.1))
     if usual < 0.7 or least > 1.4 * max(float(np.quantile(first, 0.1)), 1.0):
-        found = f"state positions are usually {usual:.2g} spacings of {spacing:g} m from the nearest other particle"
-        raise InputError(f"{found}, but must be about one: the state is of a run with another spacing.")
+        found = f"state positions has a typical distance of {usual:.2g} spacings of {spacing:g} m between neighbours"
+        raise InputError(f"{found}, but must have about one spacing: the state is of a run with another spacing.")
 
 
 TORN = 0.015

@@ -158,7 +158,7 @@ class SceneParameters:
                     raise InputError(f"direction {name} is given, but must be left out, {why}.")
         if "tilt" in along:
             if "tilt" not in values and self._simulation.scene.schedule.leads_gravity:
-                why = "as the scene's schedule says where gravity points: give the tilt among the parameters, too"
+                why = "as the scene's schedule sets the direction of gravity: give tilt among the parameters, too"
                 raise InputError(f"direction tilt is given, but must be left out, {why}.")
             angles = values.get("tilt", np.zeros(self._simulation.dimension - 1))
             along = {**along, "gravity": self._tilt.tangent(angles, along["tilt"])}

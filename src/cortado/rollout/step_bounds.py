@@ -53,8 +53,8 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
     strongest = stability_limits(scene, values)  # at the strongest scheduled gravity
     if (shortest := min(float(bounds.min()), strongest["gravity"], strongest["depth"])) < least:
         wanted = f"at least {least:g} s in this precision"
-        advice = "increase solver.greatest_time_step, or whatever else limits the time step"
-        raise InputError(f"The time step is chosen as {shortest:.3g} s at most, but must be {wanted}: {advice}.")
+        advice = "increase solver.greatest_time_step, or relax another limit of the time step"
+        raise InputError(f"The adaptive time step is at most {shortest:.3g} s, but must be {wanted}: {advice}.")
     return bounds
 
 
@@ -170,7 +170,7 @@ def expected_steps(simulation: Simulated, time: float, values: Arrays) -> int:
 
 def counted_steps(time: float, steps: float) -> int:
     if steps > MOST:
-        raise InputError(f"time is {time:g} s, but must be less, as that takes about {steps:.2g} steps.")
+        raise InputError(f"time is {time:g} s, but must be less, as such a run takes about {steps:.2g} steps.")
     return max(ceil(steps), 1)
 
 

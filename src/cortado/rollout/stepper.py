@@ -63,7 +63,7 @@ def backward_step(rollout: Rollout, estimator: ReverseEstimator | None) -> Backw
         require_methods("gradient", estimator, ("derivative",), wanted)
         if solver.layout.batch is not None and not estimator.batches:
             found = f"{type(estimator).__name__} is given a batch, but has no `batches = True`"
-            raise InputError(f"{found}, which says that it treats each scene by itself.")
+            raise InputError(f"{found}, which declares that the estimator treats each scene separately.")
     if require_hash(estimator) not in rollout.derivatives:
         parts = solver.gradient_memory(rollout.log)
         require(parts, "take a larger spacing or fewer pressure iterations", solver.device)
@@ -115,7 +115,9 @@ class AdjointGrowth:
         if growth > MOST_GROWTH and not self._warned:
             self._warned = True
             found = f"by e^{growth:.1f}" if math.isfinite(growth) else "beyond 1e19, whose square overflows,"
-            back = f"back from {self._ended:.4g} s to {start:.4g} s, so that gradients of earlier steps point anywhere"
+            back = (
+                f"backwards from {self._ended:.4g} s to {start:.4g} s, so that gradients of earlier steps are useless"
+            )
             advice = "chain fewer steps, or take gradient=cortado.gradients.AdjointViscosity()"
             warn(f"The adjoint of the state has grown {found} over {self._steps} steps, {back}: {advice}.")
 
@@ -163,7 +165,7 @@ class Stepper:
     def on_host(self, state: DeviceState) -> States:
         """Return a state on the device as NumPy arrays."""
         if not isinstance(state, DeviceState):
-            raise InputError(f"state is {shown(state)}, but must be a DeviceState, of simulation.on_device.")
+            raise InputError(f"state is {shown(state)}, but must be a DeviceState from simulation.on_device.")
         return DeviceStates(self._simulation).on_host(state)
 
     @in_turn
@@ -249,8 +251,8 @@ class Stepper:
         values = residual.values
         residual.evaluation.bring_back()
         if "mobility" in along and not rollout.substeps:
-            why = 'as nothing diffuses where the mobility is 0: step(..., along=["mobility"])'
-            raise InputError(f"direction mobility is given, but must be named where the step is taken, {why}.")
+            why = 'as a step with mobility 0 computes no diffusion: step(..., along=["mobility"])'
+            raise InputError(f"direction mobility is given, but must be named in the call of step, too, {why}.")
         space.set_direction(rollout, values, along, dot, parameters_dot, np.broadcast_to(times, len(rollout.clocks)))
         self._rows.write(rows, parameters_dot)
         lost = of_lost(rollout, dot, times, parameters_dot)
@@ -260,7 +262,9 @@ class Stepper:
 
     def _place_of(self, residual: StepResidual) -> HostStates:
         if not isinstance(residual, StepResidual) or residual.evaluation.rollout is not self.rollout:
-            raise InputError(f"residual is {shown(residual)}, but must be one that this stepper's step returned.")
+            raise InputError(
+                f"residual is {shown(residual)}, but must be a residual that this stepper's step returned."
+            )
         return residual.place
 
     @cached_property

@@ -131,7 +131,7 @@ class BodyMotion(Summed):
     def summed(self, at: SensedScene) -> LoadSum:
         free = [table.name for table in at.solids if table.motion == "free"]
         if self.solid not in free:
-            wanted = f"the name of a free body, of {shown(free)}" if free else "of a scene with free bodies"
+            wanted = f"the name of a free body, one of {shown(free)}" if free else "in a scene with free bodies"
             raise InputError(f"solid is {shown(self.solid)}, but must be {wanted}.")
         return LoadSum()
 

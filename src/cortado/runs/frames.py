@@ -203,8 +203,8 @@ class Film:
 def pace_of(times: Times, picture: Picture, rate: float | None = None) -> Pace:
     asked = picture.film_frames or None
     if asked is not None and len(times) < asked:
-        found = f"the film has {counted(len(times), 'frame')} of the {asked} that picture.film_frames asks for"
-        warn(f"{found}, as the run has no more; a smaller --record-every or more steps give more.")
+        found = f"the film has {counted(len(times), 'frame')} instead of the {asked} of picture.film_frames"
+        warn(f"{found}, as the run has no more frames: take a smaller --record-every or more steps.")
     return Pace.of(times, asked, picture.film_speed, rate)
 
 
@@ -286,7 +286,7 @@ class SolidMotions(dict[str, SolidMotion]):
         return cls({name: SolidMotion.of(name, fields, dimension) for name in solids_in(fields)})
 
     def __missing__(self, name: object) -> SolidMotion:
-        known = f"moved {', '.join(self)}" if self else "moved none"
+        known = f"has the moving solids {', '.join(self)}" if self else "has no moving solids"
         raise InputError(f"solids has no {shown(name)}, as the run {known}.")
 
     def at(self, scene: Scene, known: NDArray[Any], recorded: NDArray[np.intp], times: NDArray[Any]) -> SolidMotions:

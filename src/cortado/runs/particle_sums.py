@@ -39,11 +39,11 @@ class Ride:
     def table(self, at: SensedScene) -> SolidTable:
         moving = {table.name: table for table in at.solids if table.moves}
         if self.on not in moving:
-            names = f", of {', '.join(map(shown, moving))}" if moving else "; the scene has none"
-            raise InputError(f"A sensor is on {shown(self.on)}, but must be on a solid that moves{names}.")
+            names = f": {', '.join(map(shown, moving))}" if moving else ", but the scene has none"
+            raise InputError(f"A sensor is on {shown(self.on)}, but must be on a moving solid{names}.")
         if self.turns and any(at.lattice.domain.lengths):
-            found = f"A view that turns with the solid {shown(self.on)} has no images along periodic axes"
-            raise InputError(f'{found}: give a sensor on it the axes "world", or read a solid_load.')
+            found = f"A sensor with axes that rotate with the solid {shown(self.on)} has no periodic images"
+            raise InputError(f'{found}: take axes "world" for the sensor, or a solid_load.')
         return moving[self.on]
 
     def carrier(self, at: Reading) -> "Carrier":
@@ -112,7 +112,7 @@ def axes_of(axes: Any, is_carried: bool) -> Axes:
     if not isinstance(axes, str) or axes not in ("world", "body"):
         raise InputError(f'axes is {shown(axes)}, but must be "world" or "body".')
     if axes == "body" and not is_carried:
-        raise InputError('axes is "body", but must be "world", as the sensor is on no solid: name a solid by on.')
+        raise InputError('axes is "body", but must be "world", as no solid carries the sensor: name a solid by on.')
     return "body" if axes == "body" else "world"
 
 

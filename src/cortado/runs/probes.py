@@ -113,7 +113,7 @@ class FlowRate(Summed):
         """
         self.position, self.normal = point("position", position), direction("normal", normal)
         if len(self.position) != len(self.normal):
-            wanted = f"must have {len(self.position)}, as position has"
+            wanted = f"must have {len(self.position)}, like position"
             raise InputError(f"normal has {len(self.normal)} components, but {wanted}.")
         self.reach = None if reach is None else positive("reach", reach)
 

@@ -83,7 +83,7 @@ class QuantityEvaluator:
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
         if not isinstance(solver, ParticleSolver):
-            raise InputError("The solver of this scene is no ParticleSolver, so that quantities cannot be computed.")
+            raise InputError("The solver of this scene is not a ParticleSolver, so that quantities cannot be computed.")
         self.solver, self.turn, self.dimension = solver, solver.turn, scene.dimension
         self.lattice = solver.lattice
         self.solids: tuple[SolidTable, ...] = scene.solid
@@ -183,8 +183,10 @@ class QuantityEvaluator:
             if not is_load(name):
                 check_quantity(name)
             elif name not in self._formulas:
-                solids = ", ".join(self.solver.system.solids) or "none"
-                raise InputError(f"{name!r} is of the solid {name.removesuffix(LOAD)!r}, but the scene has {solids}.")
+                solids = ", ".join(self.solver.system.solids) or "no solids"
+                raise InputError(
+                    f"{name!r} is a load on the solid {name.removesuffix(LOAD)!r}, but the scene has {solids}."
+                )
         return wanted
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
@@ -212,7 +214,9 @@ class QuantityEvaluator:
         rollout.forward(keep=False)
         found = solver.pressures()
         if found is None:
-            raise InputError("This scene is computed without a pressure of particles, so that no pressure can be read.")
+            raise InputError(
+                "The solver of this scene computes no pressure of particles, so that no pressure can be read."
+            )
         pressures = wp.clone(found)  # as a replay overwrites what was found
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]

@@ -136,10 +136,12 @@ class RunFolder:
         """Raise `InputError` if a file of the scene, such as a mesh, is missing or has changed since the run began."""
         for name, mark in read_json(self.environment).get("files", {}).items():
             if not Path(name).is_file():
-                raise InputError(f"{name} is missing, but the run in {self.path} was made with it: put it back.")
+                raise InputError(
+                    f"{name} is missing, but the run in {self.path} was made with this file: put the file back."
+                )
             if _mark(name) != mark:
-                found = f"{name} has changed since the run in {self.path} was made with it"
-                raise InputError(f"{found}: put the former file back.")
+                found = f"{name} has changed since the run in {self.path} began"
+                raise InputError(f"{found}: restore the former file.")
 
     def write_sensors(self, readings: Mapping[str, Readings]) -> None:
         if readings:
@@ -198,7 +200,7 @@ class RunFolder:
     def _make_room(self, kind: str, overwrite: bool) -> None:
         present = [name for name in (self.environment.name, *_FILES, *_FOLDERS) if (self.path / name).exists()]
         if not present and Path.cwd().is_relative_to(self.path.resolve()):
-            raise InputError(f"{self.path} is the current folder, or contains it; choose another --out.")
+            raise InputError(f"{self.path} is or contains the current folder; choose another --out.")
         runs = [] if present else sorted(one.parent.name for one in self.path.glob(f"*/{self.environment.name}"))
         if runs:
             raise InputError(f"{self.path} contains other runs, such as {runs[0]}; choose another --out.")
@@ -206,7 +208,7 @@ class RunFolder:
             raise InputError(f"{self.path} holds {', '.join(present)}, but no run of Cortado; choose another --out.")
         if present and not overwrite:
             resumable = kind in ("run", "optimise") and kind == read_json(self.environment).get("kind")
-            advice = f"replace it with --overwrite{', or go on with it by --resume' if resumable else ''}"
+            advice = f"replace the run with --overwrite{', or continue the run with --resume' if resumable else ''}"
             raise InputError(f"{self.path} already holds a run; choose another --out, or {advice}.")
         self._remove_unfinished()
         if not present:
@@ -283,7 +285,7 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
     for name, (before, now) in sorted(differences(former, given).items()):
         field = ".".join(part if not part.isdigit() else f"[{part}]" for part in name.split(".")).replace(".[", "[")
         found = f"The run in {folder} was begun with {field} = {_written(before)} and is now given"
-        raise InputError(f"{found} {field} = {_written(now)}; give the former, or choose another --out.")
+        raise InputError(f"{found} {field} = {_written(now)}; give the former value, or choose another --out.")
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:

@@ -77,7 +77,7 @@ def corner(what: str, values: Any) -> NDArray[Any]:
     if array.shape not in ((2,), (3,)):
         raise InputError(f"{what} has shape {array.shape}, but must have 2 or 3 components.")
     if np.isnan(array).any():
-        raise InputError(f"{what} is {array.tolist()}, but must be numbers.")
+        raise InputError(f"{what} is {array.tolist()}, but must not contain NaN.")
     return array
 
 
@@ -122,7 +122,7 @@ def value_of(sensor: Sensor, at: Reading) -> NDArray[Any]:
 
 def in_dimension(what: str, values: NDArray[Any], dimension: int) -> NDArray[Any]:
     if len(values) != dimension:
-        raise InputError(f"{what} has {len(values)} components, but must have {dimension}, as the scene has.")
+        raise InputError(f"{what} has {len(values)} components, but must have {dimension}, one for each axis.")
     return values
 
 
@@ -197,7 +197,7 @@ def from_csv(path: Path) -> dict[str, Readings]:
     columns = read_columns(path)
     times, found = columns.pop(TIME, np.zeros(0)), dict[str, dict[str, str]]()
     if not len(times):
-        raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {TIME}.")
+        raise InputError(f"{path} has the columns {', '.join(columns)}, but must have the column {TIME}.")
     for head in columns:
         name, dot, number = head.rpartition(" [")[0].rpartition(".")
         if not dot or not head.endswith("]"):
@@ -256,27 +256,27 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
     times = named.get(("time", "s"), named.get(("time", None)))
     known = {f"{name}.{column}": (own, column) for name, own in readings.items() for column in own.units}
     if times is None:
-        wanted = f"{TIME}, and some of {', '.join(known)}"
+        wanted = f"{TIME}, and at least one of {', '.join(known)}"
         raise InputError(f"{path} has the columns {', '.join(columns)}, but must have {wanted}.")
     found = []
     for (name, its_unit), values in named.items():
         if name == "time":
             continue
         if name not in known:
-            raise InputError(f"{path} has the column {name!r}, but must have some of {', '.join(known)}.")
+            raise InputError(f"{path} has the column {name!r}, but the sensors have the columns {', '.join(known)}.")
         own, column = known[name]
         if its_unit is not None and its_unit != own.units[column]:
-            raise InputError(f"{path} has {name} in {its_unit}, but must have it in {own.units[column]}.")
+            raise InputError(f"{path} has {name} in {its_unit}, but {name} must be in {own.units[column]}.")
         there = np.isfinite(times) & np.isfinite(values)
         within = there & (times >= own.times[0]) & (times <= own.times[-1])
         if not within.any():
             ends = f"{own.times[0]:g} to {own.times[-1]:g} s"
-            raise InputError(f"{path} has no value of {name} from {ends}, the times of the run, but must have one.")
+            raise InputError(f"{path} has no value of {name} from {ends}, but must have a value during the run.")
         simulated = np.interp(times[within], own.times, own[column])
         left_out = int(np.count_nonzero(there & ~within))
         found.append(MeasuredColumn(name, own.units[column], times[within], values[within], simulated, left_out))
     if not found:
-        raise InputError(f"{path} has only times, but must have some of {', '.join(known)}.")
+        raise InputError(f"{path} has only times, but must have at least one of {', '.join(known)}.")
     return found
 
 
@@ -293,8 +293,8 @@ def measured_columns(
         name = column if whose == own else name
         wanted = {"time": "s", **units}.get(name, unit)
         if unit is not None and unit != wanted:
-            raise InputError(f"{path} has {name} in {unit}, but must have it in {wanted}.")
+            raise InputError(f"{path} has {name} in {unit}, but {name} must be in {wanted}.")
         if name in found:
-            raise InputError(f"{path} has 2 columns {name!r}, but must have each of them once.")
+            raise InputError(f"{path} has 2 columns {name!r}, but must have each column once.")
         found[name] = values
     return found

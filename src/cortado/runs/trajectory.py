@@ -70,9 +70,9 @@ def chosen(quantities: Mapping[str, NDArray[Any]], name: str, fields: Mapping[st
     if name == "speed" and name not in quantities:
         return np.linalg.norm(fields["velocities"], axis=-1)
     if name not in quantities:
-        found = f"{', '.join(quantities)} and the speed are" if quantities else "only the speed is"
-        advice = f'record it, as in simulation.run(steps, record=["{name}"]), or ask simulation.quantity for it'
-        raise InputError(f"{name} was not recorded, {found} there: {advice}.")
+        found = f"{', '.join(quantities)} and the speed" if quantities else "only the speed"
+        advice = f'record {name}, as in simulation.run(steps, record=["{name}"]), or take simulation.quantity'
+        raise InputError(f"{name} was not recorded, but the trajectory has {found}: {advice}.")
     return quantities[name]
 
 
@@ -137,11 +137,11 @@ class Trajectory:
         frames = {len(self.times), len(self.steps), len(self.positions), len(self.velocities)}
         steps = {name: len(column) for name, column in self.diagnostics.items()}
         if self.positions.ndim != 3 or self.positions.shape != self.velocities.shape or len(frames) > 1:
-            wanted = "Positions and velocities must both be (frames, n, d) with a time and a step per frame"
+            wanted = "Positions and velocities must both be (frames, n, d), with a time and a step for each frame"
             found = f"{self.positions.shape}, {self.velocities.shape}, {self.times.shape} and {self.steps.shape}"
-            raise InputError(f"{wanted}, but found {found}.")
+            raise InputError(f"{wanted}, but have the shapes {found}.")
         if len(set(steps.values())) > 1:
-            raise InputError(f"The diagnostics must be of one length, but have {steps}.")
+            raise InputError(f"The diagnostics must have the same length, but have the lengths {steps}.")
 
     def __repr__(self) -> str:
         times = f", {self.times[0]:.4g} to {self.times[-1]:.4g} s" if len(self) else ""
@@ -228,7 +228,7 @@ class Trajectory:
         """Return a copy of the last state. If `Simulation.run` continues from this state, the results are exactly those
         of a run without interruption. Raises `InputError` if there is no frame."""
         if not len(self):
-            raise InputError("The trajectory has no frame, but must have one to continue from.")
+            raise InputError("The trajectory has no frame, but a run continues from the last frame.")
         own = {name: array.copy() for name, array in {**fields_of(self[-1]), **self.constants}.items()}
         taken = self.diagnostics.get("time_steps", np.zeros(0))[: int(self.steps[-1]) - (self.begun or 0)]
         size = float(taken[-1]) if len(taken) else 0.0

@@ -69,7 +69,9 @@ def checked_makers(forces: Any) -> tuple[ForceMaker, ...]:
         raise InputError(f"forces is {shown(forces)}, but must be {wanted}.")
     for k, maker in enumerate(forces):
         if isinstance(maker, type) or not callable(getattr(maker, "force", None)):
-            wanted = "but each must be an object with a method force(setting), such as cortado.forces.Body(f, k=2.0)"
+            wanted = (
+                "but each force must be an object with a method force(setting), such as cortado.forces.Body(f, k=2.0)"
+            )
             raise InputError(f"forces has {shown(maker)} at place {k}, {wanted}.")
         check_parameters("force", maker, getattr(maker, "parameters", None))
     return tuple(forces)
@@ -86,8 +88,10 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
     for maker in forces:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
             what = place.rpartition(".")[2].replace("_", " ")
-            found = f"{shown(taken[place])} and {shown(maker)} both take the place of the scene's force of {what}"
-            raise InputError(f"{found}, but only one can: leave out the other, in forces or as the phase's rheology.")
+            found = f"{shown(taken[place])} and {shown(maker)} both replace the scene's force of {what}"
+            raise InputError(
+                f"{found}, but only one force can: remove the other from forces or from the phase's rheology."
+            )
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
     own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
     own += [(parameter, "a solid") for parameter in motion_parameters(scene.solid)]
@@ -159,14 +163,14 @@ NEEDED = ("new_parameters", "new_log", "set_substeps", "reset", "make_room", "st
 
 def built(maker: SolverMaker, setting: SolverSetting) -> Solver:
     if setting.batch is not None and not getattr(maker, "batches", False):
-        raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} has no batches.")
+        raise InputError(f"batch is {setting.batch}, but must be left out, as {setting.called} supports no batches.")
     solver = maker.build(setting)
     if not callable(getattr(solver, "new_state", None)):
         raise InputError(f"build of {setting.called} returned {shown(solver)}, but must return a solver.")
     lacking = [name for name in NEEDED if not callable(getattr(solver, name, None))]
     if lacking:
-        found = f"build of {setting.called} returned {shown(solver)}, which has no {lacking[0]}"
-        raise InputError(f"{found}, but must have one: see cortado.solvers.solver.Solver.")
+        found = f"build of {setting.called} returned {shown(solver)}, which has no method {lacking[0]}"
+        raise InputError(f"{found}, but must have all methods of cortado.solvers.solver.Solver.")
     if setting.forces and not hasattr(solver, "forces"):
         raise InputError(f"forces is given, but must be left out, as {setting.called} takes no user-defined forces.")
     return solver
@@ -284,8 +288,8 @@ def _forces(setting: Setting, makers: Sequence[ForceMaker]) -> list[Force]:
             raise InputError(f"the force {name} has fields, but no method `end` that writes them after a step.")
         if batch is not None and not getattr(force, "batches", False):
             raise InputError(
-                f"batch is {batch}, but must be left out, as the force {name} has no `batches = True`, which says that "
-                "its kernels read the parameters of a particle's own scene."
+                f"batch is {batch}, but must be left out, as the force {name} has no `batches = True`, by which "
+                "a force declares that its kernels read the parameters of each particle's scene."
             )
     return sorted(forces, key=lambda one: bool(getattr(one, "is_last", False)))
 

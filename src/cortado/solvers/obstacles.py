@@ -204,7 +204,7 @@ def drained_of(scene: Scene, discrete: DiscreteScene, precision: Precision) -> D
             pulls[drain.name] = Pull(ends, sphere, sphere * (shell / spacing) ** d / d)
     if (furthest := np.abs(fluid.places).max() / spacing) > precision.furthest:
         raise InputError(
-            f"The drains would store drained particles as far as {furthest:.3g} spacings of {spacing:g} m from the "
-            f"origin, but must stay within {precision.furthest:g} in {precision.name}: take another precision."
+            f"The drains would store particles {furthest:.3g} spacings of {spacing:g} m from the "
+            f"origin, but at most {precision.furthest:g} are possible in {precision.name}: take another precision."
         )
     return Drained(mouths, pulls, fluid.places, nozzles_of(scene, discrete), discrete.periods)

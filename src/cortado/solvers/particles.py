@@ -72,7 +72,7 @@ class ParticleSolver(Staying):
         discretisation, search, layout = system.discretisation, system.search, system.layout
         precision, particles, device = layout.precision, layout.all_particles, layout.device
         if requires_grad and not discretisation.taped:
-            raise TypeError("a tape needs the kernels of system.of_one_lane(): make the solver of that system.")
+            raise TypeError("a tape needs the kernels of system.of_one_lane(): make the solver from this system.")
         self.system, self.discretisation, self.lattice, self.search = system, discretisation, system.lattice, search
         self.layout, self.device, self.forces = layout, device, tuple(system.forces)
         self.launch = KernelLauncher(particles, device, record_tape=requires_grad)

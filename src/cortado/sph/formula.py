@@ -242,11 +242,11 @@ class Formula:
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
-            raise InputError(f"{what} takes {FRACTIONS}, but only scenes of several phases have them.")
+            raise InputError(f"{what} takes {FRACTIONS}, but only scenes of several phases have mass fractions.")
         for node in ast.walk(ast.parse(self.text)):
             is_read = isinstance(node, ast.Subscript) and ast.unparse(node.value) == FRACTIONS
             if is_read and ast.literal_eval(node.slice) not in range(-phases, phases):
-                wanted = f"an index from {-phases} to {phases - 1} there, as there are {phases} phases"
+                wanted = f"an index from {-phases} to {phases - 1}, as the scene has {phases} phases"
                 raise InputError(f"{what} has {ast.unparse(node)}, but must have {wanted}.")
         return replace(self, phases=phases)
 
@@ -297,17 +297,19 @@ def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs
         if not (told or len(shape) > 1 or (shape and shape[0] not in (2, 3))):
             continue
         if not inputs.arrays:
-            raise InputError(f"{what} has the array {name}, but must have numbers and vectors: only Body has arrays.")
+            raise InputError(
+                f"{what} has the array {name}, but must have only numbers and vectors: only Body takes arrays."
+            )
         if not (1 <= len(shape) <= MOST_AXES and 0 < prod(shape) <= MOST_NUMBERS):
             wanted = f"one to {MOST_AXES} axes, and 1 to {MOST_NUMBERS} numbers"
-            raise InputError(f"{what} has the array {name} of shape {shape}, but must have one with {wanted}.")
+            raise InputError(f"{what} has the array {name} of shape {shape}, but an array must have {wanted}.")
         entries = getattr(annotation, "dtype", Any)
         if entries not in (Any, float, wp.float32, wp.float64) or getattr(annotation, "ndim", len(shape)) != len(shape):
             found_one = f"{what} has the array {name} of shape {shape}, with an annotation that does not fit"
             raise InputError(f"{found_one}, but must be annotated as floats with {len(shape)} axes.")
         found[name] = shape
     if sum(map(prod, found.values())) > MOST_NUMBERS:
-        raise InputError(f"{what} has arrays of more than {MOST_NUMBERS} numbers together, but must have fewer.")
+        raise InputError(f"{what} has arrays of more than {MOST_NUMBERS} numbers in total, but must have fewer.")
     return found
 
 
@@ -317,28 +319,28 @@ def _arguments(
     signature, known = inspect.signature(function, follow_wrapped=False).parameters, (*first.names, "t")
     for argument in signature.values():
         if argument.kind is not argument.POSITIONAL_OR_KEYWORD:
-            raise InputError(f"{what} has the argument {argument}, but must have positional arguments alone.")
+            raise InputError(f"{what} has the argument {argument}, but must have only positional arguments.")
     if any(name in known and known.index(name) != place for place, name in enumerate(signature)):
         found = f"{what} has the arguments {', '.join(signature)}"
-        raise InputError(f"{found}, but must have {', '.join(known[:2])} first, and then {known[2]} if it takes time.")
+        raise InputError(f"{found}, but must have {', '.join(known[:2])} first, and then, optionally, {known[2]}.")
     for name in given:
         if name not in signature:
             found = f"({', '.join(signature)})"
-            raise InputError(f"{what} is given a value of {name}, but must have {name} among its arguments {found}.")
+            raise InputError(f"{what} is given a value of {name}, but has only the arguments {found}.")
     values = {n: given.get(n, a.default) for n, a in signature.items() if n in given or a.default is not a.empty}
     for name in known:
         if name in values:
-            raise InputError(f"{what} is given a value of {name}, but the run gives it.")
+            raise InputError(f"{what} is given a value of {name}, but the run sets {name}: leave out the value.")
     taken = tuple(name for name in signature if name not in values)
     inputs = tuple(name for name in taken if name not in first.fields or name in taken[:2])
     if lacking := [name for k, name in enumerate(inputs[2:]) if k > 0 or name not in TIME]:
         found = f"{what} is given no value of {', '.join(lacking)}"
-        raise InputError(f"{found}, but must have one of each parameter, as in {lacking[0]}=1.0.")
+        raise InputError(f"{found}, but must have a value of each parameter, as in {lacking[0]}=1.0.")
     if len(inputs) not in (2, 3) or tuple(signature)[: len(taken)] != taken or taken[: len(inputs)] != inputs:
-        of_particles = f", {', '.join(first.fields)} or none of them" if first.fields else ""
-        wanted = f"two {first.kind}s first, then time or nothing{of_particles}, and then parameters"
+        of_particles = f" and any of {', '.join(first.fields)}" if first.fields else ""
+        wanted = f"two {first.kind}s first, then optionally time{of_particles}, and then parameters"
         found = f"{what} has {', '.join(taken) or 'nothing'} without a value"
-        raise InputError(f"{found}, but must have {wanted} that all have values.")
+        raise InputError(f"{found}, but must have {wanted} with values.")
     return taken, values
 
 
@@ -353,9 +355,9 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
             found = re.findall("error: (.*)", said.read().decode(errors="replace"))
             text = TYPES.sub(lambda t: "a vector" if "vec" in t[0] else "a number", found[0]) if found else str(error)
             reason = text.replace("\\n", "\n").strip().splitlines()[-1:] or [type(error).__name__]
-            wanted = f"numbers, vectors of three components and functions of Warp alone, and return a {returned}"
+            wanted = f"only numbers, vectors of three components and functions of Warp, and return a {returned}"
             first = reason[0].lstrip("; ").rstrip(".")
-            raise InputError(f"{what} cannot be compiled: {first}; it must use {wanted}.") from error
+            raise InputError(f"{what} cannot be compiled: {first}; the function must use {wanted}.") from error
         said.seek(0)
         sys.stderr.write(said.read().decode(errors="replace"))
 

@@ -50,7 +50,7 @@ class FreeEnergy:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise InputError(f"FreeEnergy has the name {shown(self.name)}, but must have a text.")
+            raise InputError(f"FreeEnergy has the name {shown(self.name)}, but the name must be a text.")
         require_function(f"FreeEnergy {self.name}'s value", self.value, "fractions (n, phases)")
         require_function(f"FreeEnergy {self.name}'s functions", self.functions, "a precision", "a number of phases")
         if not 0.0 <= as_one_number(f"FreeEnergy {self.name}'s curvature", self.curvature) < np.inf:
@@ -67,7 +67,7 @@ class FreeEnergy:
         for name in ("gradient", "hessian_product"):
             if not isinstance(given := getattr(found, name, None), wp.Function):
                 wanted = "an object whose gradient and hessian_product are functions under wp.func"
-                raise InputError(f"{what} must return {wanted}, but its {name} is {shown(given)}.")
+                raise InputError(f"{what} must return {wanted}, but {name} is {shown(given)}.")
         fractions, module = precision.fractions(phases), kernel_module(f"free_energy_{code_words(self.functions)}")
         gradient, hessian_product = found.gradient, found.hessian_product
 
@@ -245,8 +245,8 @@ def stable_substeps(
     number = float(np.ceil(time_step / limit))
     if number > MOST_SUBSTEPS:
         raise OutOfRangeError(
-            f"mobility is {mobility:g} m2/s, which takes {number:.3g} explicit steps of diffusion in a time step, but "
-            f"must not take more than {MOST_SUBSTEPS}: lower it, interface_width or time_step."
+            f"mobility is {mobility:g} m2/s, which takes {number:.3g} explicit diffusion steps in a time step, but "
+            f"at most {MOST_SUBSTEPS} are possible: lower mobility, interface_width or time_step."
         )
     return int(number)
 

@@ -145,7 +145,7 @@ class FreeSolids:
 
     def part(self, layout: Layout, requires_grad: bool) -> "FreeSolidsPart":
         if requires_grad:
-            raise MissingDerivativeError("solids that move have no tape: try gradients.Exact.")
+            raise MissingDerivativeError("Warp's tape cannot differentiate moving solids: take gradients.Exact.")
         return FreeSolidsPart(self, layout)
 
 

@@ -89,8 +89,8 @@ class InPrecision(ast.NodeTransformer):
 
     def visit_Name(self, node: ast.Name) -> ast.AST:
         if node.id in self._arrays:
-            found = f"{self._what} has the array {node.id} without indices, or gives it another value"
-            wanted = f"read its numbers, as in {node.id}[0], or its sizes by {node.id}.shape"
+            found = f"{self._what} uses the array {node.id} without indices, or assigns to {node.id}"
+            wanted = f"read single numbers, as in {node.id}[0], or sizes, as in {node.id}.shape"
             raise InputError(f"{found}, but must {wanted}.")
         return self._resolved(node) if isinstance(node.ctx, ast.Load) else node
 
@@ -104,7 +104,7 @@ class InPrecision(ast.NodeTransformer):
         node.value = self.visit(node.value)
         numbers = [self._index(part) for part in parts]
         if isinstance(node.value, ast.Name) and node.value.id in self._given and set(numbers) - set(range(-3, 3)):
-            raise InputError(f"{self._what} has {ast.unparse(node)}, but must have an index of 0, 1 or 2 there.")
+            raise InputError(f"{self._what} has {ast.unparse(node)}, but the index of a component must be 0, 1 or 2.")
         written: list[ast.expr] = [ast.Constant(number) for number in numbers]
         node.slice = ast.Tuple(written, ast.Load()) if isinstance(node.slice, ast.Tuple) else written[0]
         return node
@@ -112,7 +112,7 @@ class InPrecision(ast.NodeTransformer):
     def _read(self, node: ast.Subscript, parts: list[ast.expr], first: int, shape: tuple[int, ...]) -> ast.AST:
         if len(parts) != len(shape) or any(isinstance(part, (ast.Slice, ast.Starred)) for part in parts):
             found = f"{self._what} has {ast.unparse(node)}"
-            raise InputError(f"{found}, but must have an index for each axis of its shape {shape}.")
+            raise InputError(f"{found}, but must have an index for each axis of the shape {shape}.")
         place = _number(node, first)
         for k, (part, size) in enumerate(zip(parts, shape, strict=True)):
             own = ast.BinOp(self._place(node, part, size), ast.Mult(), _number(node, prod(shape[k + 1 :])))
@@ -124,8 +124,8 @@ class InPrecision(ast.NodeTransformer):
         if number is None:
             return _call(PLACE, _call(REAL, self.visit(part)), _number(node, size))
         if not -size <= number < size:
-            found = f"{self._what} has {ast.unparse(node)}, which has the index {number}"
-            raise InputError(f"{found}, but must have one from {-size} to {size - 1} there.")
+            found = f"{self._what} has {ast.unparse(node)} with the index {number}"
+            raise InputError(f"{found}, but the index must be from {-size} to {size - 1}.")
         return _number(node, number % size)
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST:
@@ -171,8 +171,8 @@ class InPrecision(ast.NodeTransformer):
     def _index(self, node: ast.expr) -> int:
         number = self._whole(node)
         if number is None:
-            wanted = "whole numbers there, or what follows from the counts of its loops"
-            raise InputError(f"{self._what} has the index {ast.unparse(node)}, but must have {wanted}.")
+            wanted = "whole numbers or expressions of loop counters"
+            raise InputError(f"{self._what} has the index {ast.unparse(node)}, but indices must be {wanted}.")
         return number
 
     def _whole(self, node: ast.expr) -> int | None:
@@ -237,7 +237,7 @@ def text_for_warp(
     local = {node.id for node in ast.walk(function) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
     own = local | {argument.arg for argument in function.args.args}
     if not returns(function.body):
-        raise InputError(f"{what} may end without return, but must return a {kind}, whatever its arguments are.")
+        raise InputError(f"{what} may end without return, but must return a {kind} for all arguments.")
     check_names(what, function, own, frozen.scope)
     check_calls(what, function, own, frozen.scope)
     check_truths(what, function)
@@ -262,12 +262,12 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
         called = _found(node.func, scope)
         if root not in scope and root in BUILTINS:
             if name == "round" and len(node.args) + len(node.keywords) != 1:
-                raise InputError(f"{what} rounds to digits, but must have round of one number alone.")
+                raise InputError(f"{what} must call round with one number only.")
         elif not isinstance(called, wp.Function) and called is not float:
             package = str(getattr(called, "__module__", None) or "").partition(".")[0]
             if package != "warp" and not (package == "math" and called.__name__ in MATH):
-                wanted = f"functions under @wp.func, {', '.join(BUILTINS)}, and functions of math that Warp has too"
-                found = f"{what} cannot be compiled: it calls {name}"
+                wanted = f"functions under @wp.func, {', '.join(BUILTINS)}, and functions of math that Warp supports"
+                found = f"{what} cannot be compiled: the code calls {name}"
                 raise InputError(f"{found}, but may only call functions of Warp, {wanted}.")
 
 
@@ -288,8 +288,10 @@ def check_truths(what: str, function: ast.FunctionDef) -> None:
     truths = {name for name, values in assigned.items() if all(_is_truth(value, set()) for value in values)}
     for node in ast.walk(function):
         if isinstance(node, ast.BoolOp) and node not in tests and not _is_truth(node, truths):
-            found = f"{what} has {ast.unparse(node)!r}, which is an operand in Python but True or False in Warp"
-            raise InputError(f"{found}: compare the operands, or write x if x != 0.0 else y in place of x or y.")
+            found = (
+                f"{what} has {ast.unparse(node)!r}, which is one of its operands in Python but True or False in Warp"
+            )
+            raise InputError(f"{found}: compare the operands, or write x if x != 0.0 else y instead of x or y.")
 
 
 def check_helper(what: str, function: ast.FunctionDef) -> None:
@@ -305,8 +307,8 @@ def check_helper(what: str, function: ast.FunctionDef) -> None:
             wanted = "wp.rint, or wp.round, which rounds halves away from 0"
         else:
             continue
-        found = f"{what} calls a function of Warp with {ast.unparse(node)!r}, which is another number in Python"
-        raise InputError(f"{found}, but must say what is meant, by {wanted}.")
+        found = f"{what} calls a function of Warp with {ast.unparse(node)!r}, which has another value in Python"
+        raise InputError(f"{found}: use {wanted}.")
 
 
 def _is_whole(node: ast.AST, wholes: set[str]) -> bool:

@@ -34,17 +34,19 @@ _LEFT_OUT = ("CACHE", "EXTENDED_ARG", "NOP", "PRECALL", "PUSH_NULL", "RESUME")
 def plain_function(kind: str, function: Any) -> FunctionType:
     plain = function.func if isinstance(function, wp.Function) else function
     if not isinstance(plain, FunctionType):
-        raise InputError(f"{kind} has {shown(function)}, but must have a function, made by def.")
+        raise InputError(f"{kind} has {shown(function)}, but must have a function defined by def.")
     check_bare(f"{kind} function {plain.__name__}", plain)
     if plain.__code__.co_flags & (inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ASYNC_GENERATOR):
-        raise InputError(f"{kind} function {plain.__name__} waits or yields, but must be made by def, and return.")
+        raise InputError(
+            f"{kind} function {plain.__name__} is a coroutine or a generator, but must be a function that returns."
+        )
     return plain
 
 
 def check_bare(what: str, function: Any) -> None:
     if hasattr(function, "__wrapped__"):
-        found = f"{what} is one that a decorator has put around another, which Warp would compile without it"
-        raise InputError(f"{found}, but must have no decorator other than wp.func.")
+        found = f"{what} has a decorator, which Warp would ignore"
+        raise InputError(f"{found}, but may only have the decorator wp.func.")
 
 
 def source_of(what: str, function: FunctionType) -> str:
@@ -53,7 +55,7 @@ def source_of(what: str, function: FunctionType) -> str:
     try:
         return textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError) as error:
-        raise InputError(f"the text of {what} is not to be found, but must stand in a file or a notebook.") from error
+        raise InputError(f"the source code of {what} is not found, but must be in a file or a notebook.") from error
 
 
 def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDef:
@@ -63,19 +65,19 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
     except (SyntaxError, IndexError):  # a lambda on one of several lines, or lines that have moved
         found = ast.Pass()
     if function.__code__.co_name == "<lambda>":
-        raise InputError(f"{what} is no definition, but must be made by def.")
+        raise InputError(f"{what} is a lambda, but must be defined by def.")
     if isinstance(found, ast.FunctionDef):
         found.decorator_list, found.returns = [], None
         found.args.defaults, found.args.kw_defaults = [], [None] * len(found.args.kwonlyargs)
         for argument in found.args.args:
             argument.annotation = None
         if any(isinstance(one, ast.Call) and ast.unparse(one.func) == found.name for one in ast.walk(found)):
-            raise InputError(f"{what} calls itself, but must not, as Warp has no recursion.")
+            raise InputError(f"{what} calls itself, but Warp has no recursion.")
         if found.name == function.__code__.co_name and _same(_compiled(found, function.__code__), function.__code__):
             return found
     raise InputError(
-        f"the text of {what} in {function.__code__.co_filename} is not what runs where Python calls it, as the file or "
-        "the function has changed since it was imported, but must be the same: import it again."
+        f"the source code of {what} in {function.__code__.co_filename} differs from the code that Python runs, as "
+        "the file or the function has changed since the import: import the function again."
     )
 
 
@@ -177,8 +179,8 @@ class DerivativeCheck(ast.NodeVisitor):
         named = [one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)]
         named += [argument.arg for argument in node.args.args]
         if twice := [name for name in loops if named.count(name) > loops.count(name)]:
-            found = f"{self._what} gives {twice[0]}, which a loop counts with, another value too"
-            raise InputError(f"{found}, but must have another name for one of them.")
+            found = f"{self._what} assigns to {twice[0]}, which is also the counter of a loop"
+            raise InputError(f"{found}, but must have different names for the two variables.")
         self.generic_visit(node)
 
     def visit_For(self, node: ast.For) -> None:
@@ -190,8 +192,8 @@ class DerivativeCheck(ast.NodeVisitor):
 
     def _refuse_part(self, node: ast.Subscript | ast.Attribute) -> None:
         if isinstance(node.ctx, ast.Store):
-            found = f"{self._what} changes {ast.unparse(node)} alone, which Warp cannot differentiate"
-            raise InputError(f"{found}, but must make vectors whole, as in wp.vec3(a, b, c).")
+            found = f"{self._what} changes {ast.unparse(node)} separately, which Warp cannot differentiate"
+            raise InputError(f"{found}, but must assign whole vectors, as in wp.vec3(a, b, c).")
         self.generic_visit(node)
 
     visit_Subscript = visit_Attribute = _refuse_part
@@ -199,8 +201,8 @@ class DerivativeCheck(ast.NodeVisitor):
     def _refuse(self, node: ast.AST) -> None:
         line = ast.unparse(node).splitlines()[0].rstrip(":")
         raise InputError(
-            f"{self._what} has {line!r}, which Warp cannot differentiate, but must have no loops other than over "
-            f"range(k), with a number k of at most {self._most}, and not leave them before their end."
+            f"{self._what} has {line!r}, which Warp cannot differentiate, but may loop only over "
+            f"range(k), with a number k of at most {self._most}, and must not leave a loop early."
         )
 
     visit_While = visit_Break = visit_Continue = _refuse
@@ -220,8 +222,8 @@ def check_names(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
         if node.id not in scope and not hasattr(builtins, node.id):
             raise InputError(f"{what} has the name {node.id}, which is not defined.")
         if isinstance(scope.get(node.id), (list, tuple, dict, str, np.ndarray)):
-            found = f"{what} has the name {node.id}, which is a {type(scope[node.id]).__name__} outside of it"
-            raise InputError(f"{found}, but must take a number or a vector: make it a parameter of the function.")
+            found = f"{what} has the name {node.id}, which is a {type(scope[node.id]).__name__} outside the function"
+            raise InputError(f"{found}, but must be a number or a vector: make {node.id} a parameter.")
 
 
 class SizesWritten(ast.NodeTransformer):

@@ -215,7 +215,7 @@ class MovingSolids:
 
     def part(self, layout: Layout, requires_grad: bool) -> "MovingSolidsPart":
         if requires_grad:
-            raise MissingDerivativeError("solids that move have no tape: try gradients.Exact.")
+            raise MissingDerivativeError("Warp's tape cannot differentiate moving solids: take gradients.Exact.")
         return MovingSolidsPart(self, layout)
 
 

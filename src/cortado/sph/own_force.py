@@ -51,12 +51,12 @@ class OverTime:
         if self.times.ndim != 1 or not self.times.size or not np.isfinite(self.times).all():
             raise InputError(f"OverTime times are {shown(times)}, but must be a list of finite times [s].")
         if (np.diff(self.times) <= 0.0).any():
-            raise InputError(f"OverTime times are {shown(times)}, but each must be greater than the one before.")
+            raise InputError(f"OverTime times are {shown(times)}, but each time must be greater than the time before.")
         if self.values.ndim not in (1, 2) or len(self.values) != len(self.times):
-            wanted = f"({len(self.times)},) or ({len(self.times)}, d), with a row for each of the times"
+            wanted = f"({len(self.times)},) or ({len(self.times)}, d), with a row for each time"
             raise InputError(f"OverTime values have shape {self.values.shape}, but must be {wanted}.")
         if not np.isfinite(self.values).all():
-            raise InputError("A value of OverTime is not finite, but all must be finite numbers.")
+            raise InputError("A value of OverTime is not finite, but all values must be finite numbers.")
         self._course = Knots(self.times, self.values)
 
     def __repr__(self) -> str:
@@ -96,7 +96,7 @@ class OwnFunction(ABC):
         self.name = self._formula.name if name is None else name
         if not isinstance(self.name, str) or not self.name.isidentifier():
             found = f"{self.kind} has the name {shown(name)}"
-            raise InputError(f"{found}, but must have a name as Python's variables have.")
+            raise InputError(f"{found}, but must have a valid name of a Python variable.")
         self._values = {
             argument: value if isinstance(value, OverTime) else read_only(f"parameter {self.name}.{argument}", value)
             for argument, value in values.items()
@@ -201,8 +201,8 @@ def _made_again(
     SENT[function] = source
     found = made(function, name, **values)
     if found.fingerprint != fingerprint:
-        said = f"what the {made.kind} function {name} names or calls has changed since the force was made"
-        raise InputError(f"{said}, but must be the same to be used in another process: make the force anew.")
+        said = f"a value or function that the {made.kind} function {name} uses has changed since the force was made"
+        raise InputError(f"{said}, but must be the same in every process: make the force anew.")
     return found
 
 
@@ -328,7 +328,7 @@ class Rheology(OwnFunction):
         """Raise `InputError` if the function cannot be compiled, or returns a negative or infinite viscosity."""
         if setting.scene.forces.viscosity != "stress":
             found = f"forces.viscosity is {setting.scene.forces.viscosity!r}"
-            raise InputError(f"{found}, but must be 'stress' where the viscosity depends on the shear rate.")
+            raise InputError(f"{found}, but must be 'stress' for a viscosity that depends on the shear rate.")
         made = stress_of(setting.scene)(setting, self._law(setting.scene), self.parameters)
         made.compile(self._what)
         self._try({}, setting.scene, setting.layout.precision, setting.layout.device)

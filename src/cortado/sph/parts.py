@@ -109,7 +109,7 @@ class Shares(Arrays):
         known = {p.name: dtypes[p.axis][p.rank] for p in used if p.axis in dtypes}
         for name in names:
             if name not in known:
-                raise TypeError(f"shares has {name!r}, but must be a tuple of some of {', '.join(known)}.")
+                raise TypeError(f"shares has {name!r}, but must be a tuple of names among {', '.join(known)}.")
             kinds[name] = (layout.all_particles, known[name])
         super().__init__(zeros(kinds, layout.device))
         self._sums = {name: layout.sum_of(dtype) for name, (_, dtype) in kinds.items()}
@@ -247,14 +247,14 @@ class Part:
         """Make the tangent of the part. Raise `MissingDerivativeError` without forward mode."""
         if self.derivatives is None:
             name = type(self).__name__
-            raise MissingDerivativeError(f"{name} has no forward mode: let it have a method new_tangent.")
+            raise MissingDerivativeError(f"{name} has no forward mode: define the method new_tangent.")
         return self.derivatives[0](self)
 
     def new_adjoint(self) -> PartAdjoint:
         """Make the adjoint of the part. Raise `MissingDerivativeError` without reverse mode."""
         if self.derivatives is None:
             name = type(self).__name__
-            raise MissingDerivativeError(f"{name} has no reverse mode: let it have a method new_adjoint.")
+            raise MissingDerivativeError(f"{name} has no reverse mode: define the method new_adjoint.")
         return self.derivatives[1](self)
 
 
@@ -271,7 +271,7 @@ class Carried:
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:
-                wanted = "one for each particle to be sorted"
+                wanted = "one entry for each particle"
                 raise TypeError(f"field {field.name!r} has one entry, but must have {wanted}.")
         self._arrays = layout.state(fields, requires_grad)
 
@@ -285,7 +285,9 @@ class Carried:
 
     def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
         if values.keys() != set(self._arrays.names):
-            raise TypeError(f"the step carries {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
+            raise TypeError(
+                f"the step sorts {', '.join(self._arrays.names)}, but was given values of {', '.join(values)}."
+            )
         for name, a in values.items():
             unsort(step, a, state[name])
 

@@ -259,5 +259,5 @@ def check_law(
         k, phase, theta = wrong[0]
         name, viscosity = list(viscosities.items())[phase]
         found = f"{what} returns {values[k, phase, theta]:g} Pa s at a shear rate of {SHEAR_RATES[k]:.3g} 1/s"
-        wanted = "but must return a finite number that is at least 0 from 1e-06 to 1e+06 1/s"
-        raise InputError(f"{found}, for the viscosity of {name}, {viscosity:g} Pa s, {wanted}.")
+        wanted = "but must return a finite number of at least 0 at shear rates from 1e-06 to 1e+06 1/s"
+        raise InputError(f"{found} for {name} with the viscosity {viscosity:g} Pa s, {wanted}.")

@@ -198,9 +198,9 @@ def force(setting: Setting) -> Force:
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
         if viscosity < least:
             warn(
-                f"the viscosity of phase {phase.name!r} is {viscosity:g} Pa s, but for so much fluid with a surface "
-                f"tension of {tension:g} N/m it should be at least {least:.2g} Pa s: with less, the surface takes up "
-                "energy and throws out particles."
+                f"the viscosity of phase {phase.name!r} is {viscosity:g} Pa s, but for this amount of fluid with a "
+                f"surface tension of {tension:g} N/m should be at least {least:.2g} Pa s: with a lower viscosity the "
+                "surface gains energy and throws out particles."
             )
     if form == "curvature":
         known = CurvatureConstants.of(setting.discretisation.smoothing, spacing, lattice.support, dimension)

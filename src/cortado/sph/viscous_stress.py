@@ -221,7 +221,7 @@ class ImplicitViscousStress(ViscousStress):
 
     def __init__(self, setting: Setting, law: Formula | None = None, parameters: Any = ()):
         if setting.discretisation.taped:
-            raise MissingDerivativeError("implicit viscosity has no tape: try gradients.Exact.")
+            raise MissingDerivativeError("Warp's tape cannot differentiate implicit viscosity: take gradients.Exact.")
         super().__init__(setting, law, parameters)
         layout, (discretisation, *others) = setting.layout, self._made_for
         self._implicit = implicit_kernels(layout.precision)

@@ -272,7 +272,7 @@ class Maker:
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)
         if batch is not None and table.tolerance is not None:
-            raise InputError(f"batch is {batch}, but must be left out, as solver.tolerance is that of one scene.")
+            raise InputError(f"batch is {batch}, but must be left out, as solver.tolerance applies to a single scene.")
         scene, discrete = setting.scene, setting.discrete
         grid, lattice = coarse_grid(scene, discrete, system.layout.particles), discrete.lattice
         constants = lattice_constants(discrete.kernel, scene.discretisation.spacing, lattice.support, scene.dimension)
