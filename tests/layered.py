@@ -77,7 +77,7 @@ BAD_PARAMETERS: dict[str, tuple[Callable[[], Any], str]] = {
     "of another scene": (lambda: {"surface_tension": 1.0}, "parameter surface_tension is given, but must be left out"),
     "another shape": (lambda: {"gravity": np.zeros(3)}, r"parameter gravity has shape \(3,\), but must be \(2,\)"),
     "another number of steps": (lambda: {"gravity": np.zeros((4, 2))}, r"parameter gravity has shape \(4, 2\), but"),
-    "first values": (lambda: {"initial_velocities": np.zeros((64, 2))}, "must be left out with a state"),
+    "first values": (lambda: {"initial_velocities": np.zeros((64, 2))}, "must be left out"),
     "negative": (lambda: {"viscosity": -1.0}, "parameter viscosity is -1.0, but must be at least 0"),
     "NaN": (lambda: {"viscosity": np.nan}, "parameter viscosity has a value that is not finite"),
     "text": (lambda: {"viscosity": "thick"}, "parameter viscosity is 'thick', but must be a number"),

@@ -168,7 +168,7 @@ def test_the_error_is_that_at_the_measured_times(recorded, cortado_command, head
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("time,gauge.depth\n0,1\n", "has the column 'gauge.depth', but must have some of gauge.height, gauge.f"),
+        ("time,gauge.depth\n0,1\n", "has the column 'gauge.depth', but the sensors have the columns gauge.height"),
         ("time,gauge.height [mm]\n0,1\n", "has gauge.height in mm, but gauge.height must be in m"),
         ("gauge.height\n1\n", "but must have time [s], and at least one of gauge.height"),
         ("time\n1\n", "has only times"),

@@ -176,7 +176,7 @@ def test_what_does_not_fit_is_a_sentence(device):
         (lambda: Simulation(plane(), device).step(state), "of another simulation, but must be of this simulation"),
         (lambda: state["pressure"], "has no 'pressure', but has positions"),
         (lambda: simulation.step(state, {"rest_density": 900.0}), "to be given again"),
-        (lambda: pickle.dumps(state), "can be neither pickled nor copied"),
+        (lambda: pickle.dumps(state), "cannot be pickled or copied"),
         (lambda: simulation.on_host(3), "state is 3, but must be a DeviceState"),
         (lambda: simulation.step(state, {"gravity": on_device(np.zeros((3, 2)), "float32")}), "is a float32 array"),
         (lambda: simulation.step(state, {"gravity": on_device(np.zeros(2))}), r"gravity is a float64 array \(2,\) on"),

@@ -443,7 +443,9 @@ class Diverging:
         return self.inner.estimate(problem, parameters, observe)
 
 
-LEFT_OUT = r"^{} of the ensemble diverged, by which {} are left out of the average\. The first: The simulation diverged"
+LEFT_OUT = (
+    r"^{} of the ensemble diverged, so that {} are left out of the average\. The first error: The simulation diverged"
+)
 
 
 def test_differences_that_diverge_are_left_out_and_the_others_stand_for_them():
@@ -496,7 +498,7 @@ def test_guided_differences_leave_samples_out_that_diverge():
 
 
 def test_an_average_of_too_few_is_refused():
-    few = "cannot be averaged, but at most a quarter may be left out: take .* The first: The simulation"
+    few = "cannot be averaged, but at most a quarter may be left out: take .* The first error: The simulation"
     smoothed = gradients.RandomizedSmoothing(0.5, samples=2)
     averaged = gradients.EnsembleMean(0.5, samples=4, estimator=Diverging(slopes_of_quadratic(), 1))
     for made, function, words in [
@@ -517,13 +519,15 @@ def test_a_member_with_a_parameter_out_of_its_range_is_left_out_too():
     pairs = [abs(float(0.2 * drawn.offset()[0])) for _ in range(10)]
     kept = [u for u in pairs if u <= 0.18]
     assert 7 < len(kept) < 10
-    said = r"runs of the ensemble cannot be run, by which \d of 10 antithetic pairs are"
+    said = r"runs of the ensemble cannot be run, so that \d of 10 antithetic pairs are"
     with pytest.warns(CortadoWarning, match=said):
         found = mean.estimate(problem, {"viscosity": 0.18})
     assert found.left_out == 2 * (10 - len(kept))
     slopes = [problem.value_and_gradient({"viscosity": 0.18 + s * u})[1]["viscosity"] for u in kept for s in (1, -1)]
     assert found.gradient["viscosity"] == pytest.approx(np.mean(slopes), rel=1e-12)
-    with pytest.raises(InputError, match=r"cannot be averaged, .* logarithm .* The first: parameter viscosity is -4"):
+    with pytest.raises(
+        InputError, match=r"cannot be averaged, .* logarithm .* The first error: parameter viscosity is -4"
+    ):
         replace(mean, spread=5.0).estimate(problem, {"viscosity": 0.18})
 
 

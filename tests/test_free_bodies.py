@@ -318,7 +318,9 @@ def test_a_file_of_frames_tells_where_bodies_are(tmp_path):
         assert np.array_equal(read.solids[name].positions, motion.positions)
         assert np.array_equal(read.solids[name].rotations, motion.rotations)
     assert np.array_equal(read.solids["raft"].velocities, run.solids["raft"].velocities)
-    with pytest.raises(InputError, match=r"parameter raft\.velocity is given, but must be left out with a state"):
+    with pytest.raises(
+        InputError, match=r"parameter raft\.velocity is given, but must be left out, as the given state"
+    ):
         simulation.run(1, controls={"raft.velocity": np.zeros(2)}, state=read.last_state)
 
 

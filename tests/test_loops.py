@@ -109,7 +109,7 @@ def test_it_begins_at_a_state_and_leaves_lost_loops_out(simulation):
     most = estimator.around(Problem(simulation, 1, losses.CentreOfMass(PLACE)), {"g": gravity})
     drawn = [gravity + sign * 0.5 * u for u in _offsets(most, 5) for sign in (1.0, -1.0)]
     spoilt = np.sort([g[0] for g in drawn])[-2:].mean()  # beyond which there is one
-    with pytest.warns(gradients.ensembles.LeftOutWarning, match="1 of 10 runs .* cannot be run, by which 1 of 5"):
+    with pytest.warns(gradients.ensembles.LeftOutWarning, match="1 of 10 runs .* cannot be run, so that 1 of 5"):
         found = layer.smoothed(simulation, partial(loop, layer, simulation, spoilt=spoilt), estimator).estimate(
             {"g": gravity}
         )

@@ -236,7 +236,7 @@ def test_a_bad_path_is_a_sentence(changes, sentence):
 def test_a_path_is_written_and_read_and_a_solid_that_no_run_moved_is_a_sentence():
     assert Scene.from_json(space().to_json()) == space()
     run = Simulation(plane(ROTOR)).run(1)
-    with pytest.raises(InputError, match="solids has no 'paddle', as the run moved rotor"):
+    with pytest.raises(InputError, match="solids has no 'paddle', as the run has the moving solids rotor"):
         run.solids["paddle"]
     assert run[-1:].solids["rotor"].positions.shape == (1, 2)
     assert "paddle" not in run.solids

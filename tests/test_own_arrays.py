@@ -136,8 +136,8 @@ def of_vectors(x, v, w: wp.array(dtype=wp.vec3)):
 def test_what_is_wrong_is_said():
     for function, w, words in [
         (two, np.ones(7), "has w.0, 1., but must have an index for each axis of the shape .7,."),
-        (far, np.ones(7), "has w.7., with the index 7, but the index must be from -7 to 6"),
-        (whole, np.ones(7), "has the array w without indices"),
+        (far, np.ones(7), "has w.7. with the index 7, but the index must be from -7 to 6"),
+        (whole, np.ones(7), "uses the array w without indices"),
         (one, np.ones((2, 2, 2, 2)), "an array must have one to 3 axes"),
         (of_vectors, np.ones(7), "with an annotation that does not fit"),
         (one, np.array([1.0, np.nan, 1.0, 1.0]), "one.w has a value that is not finite, but must be numbers"),

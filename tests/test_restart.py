@@ -77,7 +77,7 @@ def test_states_that_do_not_fit_are_refused():
             "state has positions, .*, but must have positions, .*, nozzle.outlet, nozzle.emitted in this",
         ),
         (simulation.initial, {}, "must be a RestartState"),
-        (state, {"initial_velocities": state["velocities"]}, "must be left out with a state"),
+        (state, {"initial_velocities": state["velocities"]}, "must be left out, as the given state"),
     ]:
         with pytest.raises(InputError, match=what):
             simulation.run(3, controls, state=given)

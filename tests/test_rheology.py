@@ -161,7 +161,7 @@ def test_laws_of_one_s_own_that_do_not_fit_are_sentences():
         (lambda: Simulation(bingham, forces=[own]), words),
         (
             lambda: Simulation(thick(phase=[steep])),
-            r"power_law returns inf Pa s at a shear rate of .* of honey",
+            r"power_law returns inf Pa s at a shear rate of .* for honey",
         ),
     ):
         with pytest.raises(InputError, match=said):

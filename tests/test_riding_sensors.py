@@ -333,7 +333,7 @@ def test_solids_at_rest_carry_nothing_and_views_that_turn_have_no_images():
         with pytest.raises(cortado.SceneError, match=r"as the solid is at rest|left out, as no solid moves"):
             plane(solid=[sill], sensor=[{"name": "mine", **table}])
     for sensor in (PressureProbe([0.1, 0.1], on="sill"), SolidLoad("sill", axes="body")):
-        with pytest.raises(InputError, match="is on 'sill', but must be on a solid that moves; the scene has none"):
+        with pytest.raises(InputError, match="is on 'sill', but must be on a moving solid; the scene has none"):
             cortado.Simulation(plane(solid=[sill]), precision="float64").run(1, sensors={"mine": sensor})
     for make, words in (
         (lambda: PressureProbe([0.1, 0.1], on=3), "on is 3, but must be the name"),

@@ -69,7 +69,7 @@ def test_a_folder_with_a_run_is_refused_unless_overwritten(tmp_path):
     (folder.checkpoint / "1").mkdir(parents=True)
     for place in (folder.checkpoint, folder.checkpoint / "1"):
         (place / "replay.log").write_text("")
-    with pytest.raises(InputError, match=r"--out, or replace it with --overwrite, or .* --resume\.$"):
+    with pytest.raises(InputError, match=r"--out, or replace the run with --overwrite, or .* --resume\.$"):
         new_run(folder.path)
     with pytest.raises(InputError, match=r"--overwrite\.$"):
         new_run(folder.path, kind="optimise")

@@ -290,7 +290,7 @@ def test_a_run_that_goes_on_keeps_the_size():
     drawn, exported = posed(simulation.scene, first.solids, -1).solid[0], Exported(first, simulation.scene).solids[0]
     for faces in (drawn.own_solid().faces(0.1).vertices, exported.mesh.points):
         np.testing.assert_allclose(np.ptp(faces, axis=0)[:2], [0.22, 0.11], rtol=1e-6)
-    with pytest.raises(InputError, match=r"rotor\.scale is given, but must be left out with a state"):
+    with pytest.raises(InputError, match=r"rotor\.scale is given, but must be left out, as the given state"):
         simulation.run(1, controls={"rotor.scale": 1.1}, state=first.last_state)
     density = simulation.quantity("density", first, controls={"rotor.scale": 1.1})  # which is that of the run
     np.testing.assert_array_equal(density[-1], simulation.quantity("density", first.last_state))

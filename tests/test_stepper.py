@@ -403,7 +403,7 @@ def test_derivatives_directions_and_residuals_that_do_not_fit_are_sentences():
         (lambda: stepper.step(state, along=["mobil"]), "'mobil' is unknown"),
         (lambda: simulation.step("state"), "state is 'state', but must be a RestartState"),
         (lambda: simulation.step(None, {"viscosity": -1.0}), "viscosity"),
-        (lambda: simulation.step(state, velocities), "must be left out with a state"),
+        (lambda: simulation.step(state, velocities), "must be left out, as the given state"),
         (lambda: simulation.step([state, state]), "has 2 states, but must have 1"),
         (lambda: simulation.step(replace(state, fields={"positions": state["positions"]})), "but must have"),
         (lambda: simulation.step(state, {}, 2.5), "steps"),

@@ -1,4 +1,4 @@
-"""Certificates say whether gradients are right, and for how many steps gradients are useful."""
+"""Certificates, the results of tests whether gradients are right and for how many steps gradients are useful."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace

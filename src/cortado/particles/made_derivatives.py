@@ -7,8 +7,8 @@ scalar product. The position and the value of particle i have the adjoints
     x_i^ = sum_j d<T_ij, S_i^> / dx_ij - d<T_ji, S_j^> / dx_ji
     c_i^ = sum_j d<T_ij, S_i^> / dc_i + d<T_ji, S_j^> / dc_i
 
-Such derivatives are exact, but slower than handwritten derivatives. Only a Warp kernel may call a made derivative: if a
-`wp.func` calls the derivative, the generated C++ code does not compile.
+Derivatives by Warp are exact, but slower than handwritten derivatives. Only a Warp kernel may call a made derivative:
+if a `wp.func` calls the derivative, the generated C++ code does not compile.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping

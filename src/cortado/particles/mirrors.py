@@ -1,17 +1,16 @@
 """Flat walls that act on fluid by mirror images of the particles instead of by wall particles.
 
 The mirror image of a particle at x is at R x + o. The matrix R and the vector o define a reflection at a flat wall, or
-at two or three adjacent sides of the container. A reflection at the container has a number, the sum of its sides: 1, 2,
-4 are the sides at the lower ends of the axes, and 8, 16, 32 those at the upper ends. Reflections at flat faces of
-moving solids have numbers from `FACES` on.
+at two or three adjacent sides of the container. The sides of the container have the numbers 1, 2, 4 at the lower ends
+of the axes, and 8, 16, 32 at the upper ends. The number of a reflection is the sum of its sides' numbers. Reflections
+at flat faces of moving solids have numbers from `FACES` on.
 
 In lists of neighbours, an image of particle j has the number ``reflections j + reflection``. Here ``reflection`` is the
 number of the reflection, and ``reflections`` is the count of all reflections. A wall mirrors only particles in front of
-it.
+the wall.
 
-If a solid moves, the velocity of an image also depends on the displacement of the mirror in the time step, which is
-called ``swept``. Tangents and adjoints of images include derivatives with respect to the pose of the solid
-(`MovingWalls`).
+If a solid moves, the velocity of an image also depends on ``swept``, the displacement of the mirror in the time step.
+Tangents and adjoints of images include derivatives with respect to the pose of the solid (`MovingWalls`).
 """
 
 from typing import Any

@@ -2,10 +2,10 @@
 
 Wall particles of moving solids have positions at the end of a time step, and the velocity of the nearest surface point.
 
-A solid may be stretched about its middle by a scale sigma. In the solid's frame a wall particle has the position r and
-the weight w, and q is the nearest point on the surface. The vector to the surface is f = q - r. With the middle c and
-the rotation R of the solid, the wall particle is at c + R (sigma q - f) in space. The weight is sigma^(d - 1) w in d
-dimensions, because the area grows.
+A scale sigma may stretch a solid about its middle. In the solid's frame a wall particle has the position r and the
+weight w, and q is the nearest point on the surface. The vector to the surface is f = q - r. With the middle c and the
+rotation R of the solid, the wall particle is at c + R (sigma q - f) in space. The scaled weight is sigma^(d - 1) w in d
+dimensions, because the area of the surface grows.
 """
 
 from collections.abc import Mapping

@@ -1,12 +1,12 @@
 """Neighbours: particles sorted by cell, and a symmetric list of neighbours for a time step.
 
-The list reaches slightly beyond the support radius (`SKIN`), because the density is also computed at predicted
-positions. Without this margin the next state would be discontinuous when a pair enters the support during the step.
+The list reaches beyond the support radius by the margin `SKIN`, because the density is also computed at predicted
+positions. Without a margin the next state would be discontinuous when a pair enters the support during the step.
 
 The list of particle i contains j exactly if the list of j contains i.
 
-The candidates are the particles in the cells around a particle. A single thread compares 32 candidates before it
-appends neighbours, because threads of a GPU wait for one another when they append.
+The candidates for neighbours are the particles in the cells around a particle. A thread compares 32 candidates before
+it appends neighbours, because threads of a GPU wait for one another when they append.
 """
 
 from functools import cache

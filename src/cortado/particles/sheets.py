@@ -1,19 +1,17 @@
 """Sheets, which are walls without thickness. Particles on opposite sides of a sheet do not interact.
 
-Lists of neighbours are first made without sheets. Once in each time step, the following hidden neighbours of particle i
-are removed:
+The neighbour search first ignores sheets. Once in each time step, the hidden neighbours of particle i are removed:
 
 - particle j, if the segment from i to j crosses a sheet;
 - the image of j, if the segment from i to the image of j, or from the image of i to j, crosses a sheet;
-- a wall particle of a sheet, if the segment from i to it crosses another sheet or does not cross this sheet;
-- a wall particle of a solid or the container, if the segment from i to it crosses a sheet.
+- a wall particle of a sheet, if the segment from i to the wall particle crosses another sheet or does not cross this
+  sheet;
+- a wall particle of a solid or the container, if the segment from i to the wall particle crosses a sheet.
 
 The wall particles of a sheet fill the hidden part of the support, also at tips and holes. Positions of particles and
 sheets are the positions before the time step. A particle does not change the side of a sheet in a time step
-(`cortado.solvers.projection.sides`).
-
-Lists of fluid neighbours are symmetric, because the tested segment of a pair always starts at the particle with the
-lower number. Visibility has no derivative.
+(`cortado.solvers.projection.sides`). Lists of fluid neighbours are symmetric, because the tested segment of a pair
+always starts at the particle with the lower number. Visibility has no derivative.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,19 +1,18 @@
-"""One term of a time step that acts on each particle from the walls of one solid or from all walls. The derivatives of
-the term include derivatives with respect to the pose and size of moving solids.
+"""One term of a time step that acts on each particle from the walls of one solid or from all walls.
 
-A term is defined by its work W, a number that is linear in a vector ``bar`` of particle i. The sum over wall particles
-b, such as the acceleration by walls, is
+The derivatives of the term include derivatives with respect to the pose and size of moving solids. A term is defined by
+its work W, a number that is linear in a vector ``bar`` of particle i. The sum over wall particles b, such as the
+acceleration by walls, is
 
     A_i = sum_b w_b dW / dbar_i.
 
-Warp makes the gradients of W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as
-``bar``. The adjoint is the gradient of W for the adjoint of A as ``bar``. With this vector ``bar``, particle i adds to
-the adjoints of wall particle b
+Warp differentiates W. Component k of the tangent of A is the change of w_b W for the k-th unit vector as ``bar``. For
+the adjoint of the sum, ``bar`` is the adjoint of A. Particle i then adds to the adjoints of wall particle b
 
     x_b^ = -w_b dW / dx_ib,   foot_b^ = w_b dW / dfoot_b,   v_b^ = w_b dW / dv_b.
 
-The nearest point on the surface is s_b = c + R q_b, with the middle c and the rotation R of the solid, and the wall
-particle is at x_b = s_b - foot_b. R has also rotated the vector foot_b. The velocity of the wall particle is (s_b -
+The nearest point on the surface is s_b = c + R q_b, with the middle c and the rotation R of the solid. The wall
+particle is at x_b = s_b - foot_b, where foot_b is already rotated by R. The velocity of the wall particle is (s_b -
 s_b^0) / dt + R u, where u is the velocity of the surface along the solid. At the start of the step the nearest point is
 s_b^0 = c_0 + R_0 q_b. A scale sigma multiplies q_b by sigma, and w_b by sigma^(d - 1).
 

@@ -1,17 +1,18 @@
 """Emission and absorption of light along a ray through the colour field, from front to back (Max 1995).
 
 The colour field consists of the coverage A and the colour times coverage P. A sample has the optical thickness u =
-kappa ds A, with extinction kappa and step ds. The sample transmits the fraction exp(-u) of the light from behind it.
+kappa ds A, with extinction kappa and step ds. The sample transmits the fraction exp(-u) of the light from behind the
+sample.
 
 The sample emits the light kappa ds P E(u), with E(u) = (1 - exp(-u)) / u. A layer of colour P / A emits the same light,
-but the formula has no division by A.
+but kappa ds P E(u) has no division by A.
 
 The transmittance in front of sample s is T_s, with T_0 = 1. For S samples the image is
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 
-In the adjoint, the light from behind a sample is the image minus the light of all samples before it. One pass over the
-samples is therefore enough.
+In the adjoint, the light from behind a sample is the image minus the light of all samples before the sample. The
+adjoint therefore needs only one pass over the samples.
 """
 
 from functools import cache, cached_property, partial

@@ -7,7 +7,7 @@ with the smoothing kernel W:
     colour_j = sum_k c_jk colours_k
     A_g = V sum_j W(x_g - x_j),    P_g = V sum_j W(x_g - x_j) colour_j
 
-The coverage is 1 inside the fluid. Periodic images of particles are included.
+The coverage is 1 inside the fluid. The sums include periodic images of particles.
 """
 
 from collections.abc import Mapping

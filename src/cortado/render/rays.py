@@ -2,12 +2,12 @@
 
 In the camera's frame x points to the right, y up and z backwards. Pixel coordinates (u, v) are in units of half the
 width of the picture: u runs from -1 to 1 to the right, and v upwards. At depth z the pixel (u, v) shows the point (w u,
-w v, -z), with the half width w = half_width + growth z. For parallel rays growth is 0. For rays from one point
-half_width is 0.
+w v, -z), with the half width w = half_width + growth z. Parallel rays have a growth of 0. Rays from one point have a
+half_width of 0.
 
 The field at a sample is interpolated trilinearly between nodes, and is 0 outside the grid. The interpolated field is
-therefore continuous. In 2-D, the grid has one layer of nodes. The fluid then appears as a sheet whose thickness is the
-node distance.
+continuous. In 2-D, the grid has one layer of nodes, so that the fluid appears as a sheet whose thickness is the node
+distance.
 """
 
 from functools import cache

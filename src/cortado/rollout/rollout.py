@@ -1,7 +1,7 @@
 """The time loop: forward runs, checkpoints and backward passes.
 
-Steps are launched in chunks. After a chunk, the host checks for lost particles, and repeats the chunk if neighbour
-lists were too short.
+A rollout launches steps in chunks. After a chunk, the host checks for lost particles, and repeats the chunk if
+neighbour lists were too short.
 """
 
 from collections.abc import Callable, Iterable, Mapping

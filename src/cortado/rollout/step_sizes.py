@@ -1,6 +1,6 @@
 """Lengths of the time steps of a rollout, which are fixed or chosen on the device before each step.
 
-The choice depends only on the state before a step, so that a resumed run has the same steps.
+A chosen length depends only on the state before the step, so that a resumed run has the same steps.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,11 +1,11 @@
 """Sums over particles for sensors: weighted sums around a place, sums over a region, and loads on solids.
 
-The sums are computed here on the host, in float64. During a run, `cortado.runs.step_sums` computes the sums on the
+This module computes the sums on the host, in float64. During a run, `cortado.runs.step_sums` computes the sums on the
 device.
 
-A solid may carry a sensor. The solid moves an initial point x to c + T (x - c_0), with the rotation T of the solid
-since the start, its initial middle c_0, and its current middle c. Derivatives of a reading with respect to the pose of
-the solid are ``shift`` for the translation and ``twist`` for a small rotation about c.
+A solid that carries a sensor moves an initial point x to c + T (x - c_0). The solid has the initial middle c_0, the
+current middle c, and the rotation T since the start. Derivatives of a reading with respect to the pose of the solid are
+``shift`` for the translation and ``twist`` for a small rotation about c.
 """
 
 from abc import abstractmethod
@@ -39,7 +39,7 @@ class Ride:
     def table(self, at: SensedScene) -> SolidTable:
         moving = {table.name: table for table in at.solids if table.moves}
         if self.on not in moving:
-            names = f": {', '.join(map(shown, moving))}" if moving else ", but the scene has none"
+            names = f": {', '.join(map(shown, moving))}" if moving else "; the scene has none"
             raise InputError(f"A sensor is on {shown(self.on)}, but must be on a moving solid{names}.")
         if self.turns and any(at.lattice.domain.lengths):
             found = f"A sensor with axes that rotate with the solid {shown(self.on)} has no periodic images"

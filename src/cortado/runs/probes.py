@@ -1,4 +1,4 @@
-"""Sensors of pressure, flow rate and loads, the sensors of a scene, and warnings about those out of reach."""
+"""Sensors of pressure, flow rate and loads, the sensors of a scene, and warnings about sensors that reach no fluid."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol

@@ -1,20 +1,19 @@
 """Formulas of quantities on the device, with tangents and adjoints.
 
-Here n is the number density, V the volume of a particle on the rest lattice, and m its mass divided by V. The vorticity
-is an SPH sum over fluid neighbours (Monaghan 1992):
+A particle has the number density n, the volume V on the rest lattice, and the mass V m. The vorticity is an SPH sum
+over fluid neighbours (Monaghan 1992):
 
     c_i = V sum_j (v_i - v_j) x G_ij,   omega_i = c_i / (mu n_i).
 
-G_ij is the kernel gradient. The factor is mu = -(V / d) sum_j x_j . G_j on the rest lattice. With this factor, a
-rigidly rotating fluid has a vorticity of twice its angular velocity. The force of particle i on all walls, or on the
-walls of one solid, is
+G_ij is the kernel gradient. With the factor mu = -(V / d) sum_j x_j . G_j on the rest lattice, a rigidly rotating fluid
+has a vorticity of twice its angular velocity. The force of particle i on all walls, or on the walls of one solid, is
 
     f_i = s^d (V p_i / n_i^power A_i - m_i sum a_i + B_i),
 
 where s is the spacing, m_i s^d the mass of the particle, and ``power`` the solver's ``density_power``. The pressure p_i
-acts along A_i, a sum over wall particles (`ParticleSolver.wall_push`). a_i are accelerations of the particle by wall
-forces such as viscosity. B_i is the contribution of mirror images (`cortado.solvers.projection.mean_stress`). Walls
-gain the momentum that the fluid loses.
+acts along A_i, a sum over wall particles (`ParticleSolver.wall_push`). Wall forces such as viscosity give particle i
+the accelerations a_i. Mirror images add B_i (`cortado.solvers.projection.mean_stress`). Walls gain the momentum that
+the fluid loses.
 """
 
 from collections.abc import Callable

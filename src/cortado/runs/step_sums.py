@@ -1,7 +1,7 @@
 """Sums over particles for sensors, computed on the device during a run.
 
-After a chunk of steps, the sums of `cortado.runs.particle_sums` are computed for all states of the chunk, in float64
-and in a fixed order.
+After a chunk of steps, the device computes the sums of `cortado.runs.particle_sums` for all states of the chunk, in
+float64 and in a fixed order.
 """
 
 from collections.abc import Callable, Mapping

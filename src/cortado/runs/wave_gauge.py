@@ -5,11 +5,11 @@ signed distance phi from a solid, the solid occupies the fraction
 
     s_c = min(max(1/2 - phi(x_c) / step, 0), 1)
 
-where step is the distance between points. The part of the column that a flat solid occupies is therefore exact.
+where step is the distance between points. The occupied part of the column is therefore exact for a flat solid.
 Fractions of several solids add up to at most 1. Level k has the free fraction 1 - sum_c w_c s_c, and the fluid fills
 the levels from below.
 
-Above a solid with fluid below it, such as a boat, the height would jump as a function of the depth. A slope over a
+Above a solid that floats on fluid, such as a boat, the height would jump as a function of the depth. A slope over a
 depth of `FILM` replaces the jump, so that slightly compressed fluid does not appear on a deck.
 """
 

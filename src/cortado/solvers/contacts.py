@@ -1,29 +1,30 @@
 """Contacts of free bodies with the container, solids and each other: a smooth penalty with restitution and friction.
 
-At the predicted pose, surface point j of a body is inside the other solid at a depth d_j > 0. The face above the point
-has the normal n_j, and d_j is measured along this normal. Points have the weights w_j = d_j^3 / sum d_j^3. The depth of
-the contact is D = sum_j w_j d_j, which is near the greatest depth for any number of points. The body gets the momentum
+At the predicted pose of a body, surface points j of the body are inside another solid at depths d_j > 0. The depth d_j
+is measured along the normal n_j of the face above point j. Point j has the weight w_j = d_j^3 / sum d_j^3. The depth of
+the contact, D = sum_j w_j d_j, is near the greatest depth for any number of points. The contact gives the body the
+momentum
 
     P = (q / dt) m D sum_j w_j n_j,   1 / m = 1 / M + r^2 / I,
 
-and the other solid gets -P. The formula has the stiffness q, the time step dt, the mass M of the body, the arm r of P,
-and the least moment of inertia I. If the other solid is free, its terms 1 / M and r^2 / I are added to 1 / m. A contact
-oscillates with the angular frequency sqrt(q) / dt. Two free bodies have two contacts, because surface points of each
-body are inside the other body. The two contacts have the weight one half.
+and gives the other solid the momentum -P. The formula has the stiffness q, the time step dt, the mass M of the body,
+the arm r of P, and the least moment of inertia I. If the other solid is free, 1 / m also includes 1 / M and r^2 / I of
+the other solid. A body in contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies have two contacts
+of the weight one half, because surface points of each body are inside the other body.
 
 *Restitution*: The product of beta - 1 and the growth of D in the step is added to D. The factor beta is a function of
-the coefficient of restitution e. The function is fitted to simulated impacts on a wall, so that a body rebounds at e
+the coefficient of restitution e. This function is fitted to simulated impacts on a wall, so that a body rebounds at e
 times its speed. For e from 0.03 to 0.95, the error of the fit is at most 0.004. For e = 1 a body rebounds at 0.98 times
 its speed.
 
 *Friction* (Coulomb): The momentum Q = sum_j w_j (m_j u_j + M g dt) would stop all slip. Point j slips with the velocity
-u_j, and m_j is its effective mass. The term M g dt contains gravity g along the face. If the other solid is free, the
-term is zero. With the coefficient of friction mu, the body gets the momentum
+u_j and has the effective mass m_j. The term M g dt, with gravity g along the face, is zero if the other solid is free.
+With the coefficient of friction mu, the contact gives the body the momentum
 
     -Q / (1 + t^8)^(1/8),   t = sum_j w_j |m_j u_j + M g dt| / (mu (q / dt) m D).
 
-If Q is small, this momentum stops the slip. If Q is large, the magnitude is mu times the normal momentum. A body at
-rest on a slope creeps at a speed of up to t^8 / 8 times M g dt / m_j.
+If Q is small, the friction momentum stops the slip. If Q is large, the friction momentum is mu times the normal
+momentum. A body at rest on a slope creeps at a speed of up to t^8 / 8 times M g dt / m_j.
 
 Derivatives jump when a contact begins or the face above a point changes. At mu = 0 the derivative with respect to mu is
 one-sided.

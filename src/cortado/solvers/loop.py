@@ -1,4 +1,4 @@
-"""Iterations within a time step that end when the errors are small enough. Kernels decide when to stop."""
+"""Iterations within a time step, which end when kernels find that the errors are small enough."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext

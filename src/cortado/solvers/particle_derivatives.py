@@ -1,4 +1,4 @@
-"""The tangent and the adjoint of a particle solver's step, without its pressure iterations."""
+"""The tangent and the adjoint of a particle solver's step, without the pressure iterations of the solver."""
 
 from functools import partial
 from weakref import finalize

@@ -1,6 +1,6 @@
 """The protocol of a solver: steps, repeated steps, tangents and adjoints.
 
-Rollouts, gradients, files and reports of runs use a solver only through this protocol.
+Rollouts, gradients, files and reports of runs use a solver only through the protocol `Solver`.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,20 +1,20 @@
 """Surface tension by curvature, as a continuum surface force. `docs/discretisation.md` has the equations.
 
-The vector g is the gradient of the fluid's colour, and the average q of g (Shepard 1968) points into the fluid. The
-weight w is 1 at the surface and 0 inside the fluid. The gradient D B^-1 of normals is exact if normals vary linearly
-(Bonet and Lok 1999). The curvature needs only the symmetric part of the matrix D. The force acts at a mean depth delta
-below the surface, where the curvature 1 / R of the surface becomes 1 / (R - delta). The constant J is the sum of w |q|
-over the layers of a flat surface, averaged over an axis-parallel and a diagonal cut of the lattice.
+The vector g is the gradient of the fluid's colour. The average q of g (Shepard 1968) points into the fluid. A particle
+has the weight w of 1 at the surface and 0 inside the fluid. The gradient D B^-1 of surface normals is exact if normals
+vary linearly (Bonet and Lok 1999). The curvature needs only the symmetric part of the matrix D. Surface tension acts at
+a mean depth delta below the surface, where the curvature 1 / R of the surface becomes 1 / (R - delta). The constant J
+is the sum of w |q| over the layers of a flat surface, averaged over an axis-parallel and a diagonal cut of the lattice.
 
-The constants in delta, in spacings, were fitted to discs and balls of concentric rings and shells. The fitted values
-hold within 0.05 for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the depth
-`DEEP`, and the sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop would
-be (d - 1) sigma / R.
+The constants in delta [spacings] were fitted to discs of concentric rings and balls of concentric shells. The fitted
+values hold within 0.05 for every kernel with a support of at least 2.5 spacings. The computed curvature belongs to the
+depth `DEEP`, and the sum of w |q| is (1 + `EXCESS` / R) J. With delta = DEEP / (d - 1) + EXCESS the pressure in a drop
+would be (d - 1) sigma / R.
 
-A surface wave has a smaller amplitude at the depth `ACTS`, where the force acts. The squared frequency of mode n would
-therefore be too small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. The depth delta is smaller by ACTS d / (3 (d -
-1)) for this reason. The errors of pressure and of the squared frequency of mode 2 are then equal and opposite: 0.5 / R
-in 2-D and 0.75 / R in 3-D.
+A surface wave has a smaller amplitude at the depth `ACTS`, where surface tension acts. The squared frequency of a
+drop's mode n would therefore be too small by n ACTS / R in 2-D and (n + 1) ACTS / R in 3-D. As a compromise, delta is
+smaller by ACTS d / (3 (d - 1)). The errors of the pressure and of the squared frequency of mode 2 are then equal and
+opposite: 0.5 / R in 2-D and 0.75 / R in 3-D.
 """
 
 from dataclasses import dataclass

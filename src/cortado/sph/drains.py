@@ -1,23 +1,23 @@
 """Drains, which remove particles that enter them, and sinks, to which fluid flows at a given flow rate.
 
 A drain removes each particle that is inside the drain at the start of a step. At the end of the step, a removed
-particle is put at a resting position far from all others. The particle's field ``drained`` is then the number of the
-drain. The removal has no derivative.
+particle is put at a resting position far from all other particles. The field ``drained`` of a removed particle is the
+number of the drain. The removal has no derivative.
 
-A sink makes fluid flow to the sink's middle c, with y = x - c, r = |y|, the flow rate Q and d dimensions. The velocity
-after explicit forces, with the acceleration a, is
+A sink draws fluid to the sink's middle c at the flow rate Q in d dimensions. A particle at x has the vector y = x - c
+and the distance r = |y|. The velocity of the particle after explicit forces, with the acceleration a, is
 
     v* = (1 - phi) (v + dt a) + phi (u - lambda w),   u = -Q y / (S r^d),
 
 instead of v + dt a. The constant S is the part of the unit sphere or circle that walls leave open. The weight phi of
-the prescribed flow u rises smoothly from 0 at the radius r_2 to 1 at the radius r_1. Particles within r_0 < r_1 are
-removed, so that a removed particle has neighbours with prescribed motion. The term with lambda < 1 damps w, the
-velocity change by pressure in the previous step. Without this term, pressure would press fluid through the shell from
-r_0 to r_1.
+the prescribed flow u rises smoothly from 0 at the radius r_2 to 1 at the radius r_1. The sink removes particles within
+r_0 < r_1, so that a removed particle has neighbours with prescribed motion. The term lambda w, with lambda < 1, damps
+the velocity change w by pressure in the previous step. Without the term lambda w, pressure would press fluid through
+the shell from r_0 to r_1.
 
-Fluid in the shell is thinner than elsewhere, so Q is replaced by (1 + E / M) Q. The number M counts the particles
-within r_1. The number E, from -M / 4 to M / 4 and without derivative, counts particles that the sink should have
-removed but has not.
+Fluid in the shell is thinner than elsewhere, so the sink uses (1 + E / M) Q instead of Q. The number M counts the
+particles within r_1. The number E counts particles that the sink should have removed but has not. E is limited to the
+range from -M / 4 to M / 4, and has no derivative.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,12 +1,12 @@
 """Fluid from a nozzle: the motion of particles is prescribed until they pass the opening of the nozzle.
 
-`docs/discretisation.md` has the equations of the motion. Position and velocity do not jump when a particle becomes
-free. Particles further upstream than the length of the emitted column wait in reserve at separate places, without
+`docs/discretisation.md` has the equations of the motion. Position and velocity of a particle do not jump at the
+opening. Particles further upstream than the length of the emitted column wait in reserve at separate places, without
 derivative.
 
 A nozzle fed by drains emits removed particles again. When the column has room for another layer at its upstream end,
-removed particles form this layer, with the same offsets as the first particles. The choice of particles has no
-derivative.
+removed particles form the new layer, with the same offsets as the first particles. The choice of removed particles has
+no derivative.
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,10 @@
 """Free energies of a mixture, mobilities of its phases, and the Cahn-Hilliard diffusion of phases (Yang et al. 2015).
 
-`docs/discretisation.md` has the equations. The term of a pair in the operator B is antisymmetric in the two particles,
-so that the mass of each phase is constant to round-off. The projection P keeps the sum of a particle's mass fractions
-constant. The energy E decreases on particles at rest, because the factor F is not positive. Fractions are not clipped,
-because clipping would break conservation and the decrease of energy. The constant in the degenerate mobility keeps the
-mobility positive and smooth if a fraction leaves the range from 0 to 1.
+`docs/discretisation.md` has the equations. The operator B has a term for each pair of particles, which is antisymmetric
+in the two particles. The mass of each phase is therefore constant to round-off. The projection P keeps the sum of a
+particle's mass fractions constant. The free energy E of particles at rest decreases, because the factor F is not
+positive. Mass fractions are not clipped, because clipping would break conservation and the decrease of energy. A
+constant keeps the degenerate mobility positive and smooth if a mass fraction leaves the range from 0 to 1.
 """
 
 from collections.abc import Callable

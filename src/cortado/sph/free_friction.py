@@ -1,17 +1,17 @@
 """Free bodies without slip in the implicit viscous solve, with derivatives; see `cortado.sph.friction_kernels`.
 
-The velocities of bodies are additional unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). A body has the
-mass matrix M, and fluid with velocities u exerts the force F(u, U) on the body. The velocities U of the body at the
-start of the step include gravity and contact. The solve has the additional equations
+The velocities of bodies are additional unknowns of the solve (Weiler, Koschier, Brand and Bender 2018). Fluid with
+velocities u exerts the force F(u, U) on a body with the mass matrix M and the velocities U. At the start of the step, U
+includes gravity and contact. The solve has the additional equations
 
     U' = U + M^-1 J,   J = dt F(u', U'),
 
 where u' and U' are the velocities at the end of the step. The operator B of `cortado.sph.viscous_stress` remains
-symmetric, in the product weighted with the masses of particles and M. The impulse J is added to the momenta by contact
-before pressures act, so that light bodies neither oscillate nor need smaller steps.
+symmetric in the scalar product that is weighted with the masses of particles and M. The impulse J is added to the
+body's momenta before pressures act, so that light bodies neither oscillate nor need smaller steps.
 
-Friction resists velocities before pressures act, but pressures hold fluid and bodies against gravity. Therefore u
-excludes gravity, and U includes the change by the pressures of the previous step.
+Friction acts before pressures, but pressures hold fluid and bodies against gravity. Therefore u excludes gravity, and U
+includes the velocity change by the pressures of the previous step.
 """
 
 from collections.abc import Iterator

@@ -4,9 +4,9 @@ At the start of a step, a body's walls are put at the predicted pose, which the 
 velocities. The solver then changes the velocity and the angular momentum of the body. At the end of the step, the body
 moves with its new velocity and angular velocity. Momentum and angular momentum are conserved.
 
-A state stores the rotation of a body since the start, minus the unit matrix, as the columns of a matrix. If the scene
-gives a mass instead of a density, the mass takes the place of the density in kernels. Volumes are in units of a
-particle's volume.
+A state stores the rotation of a body since the start, minus the unit matrix, as the columns of a matrix. Kernels use
+the mass of a body instead of its density if the scene gives a mass. The volumes of bodies are in units of a particle's
+volume.
 """
 
 from collections.abc import Callable, Sequence

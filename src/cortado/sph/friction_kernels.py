@@ -1,23 +1,23 @@
 """Viscous friction between fluid and a free body without slip, from each particle's sums over the walls of the body.
 
-As with other walls without slip (`cortado.sph.stress_forces`), the body acts like a neighbour at the surface point
-below particle i. The surface point moves with the body. y_b is the vector to particle i from the surface at wall
-particle b, which has the weight s_b. r is the vector from the body's middle c' to particle i. The surface point is at
-c' + r - y_b and has the velocity V + W x (r - y_b), with the body's velocity V and angular velocity W. The effect of
-the body on the particle follows from three sums,
+Like other walls without slip (`cortado.sph.stress_forces`), the body acts as a neighbour at the surface point below
+particle i. The surface point moves with the body. The vector y_b leads to particle i from the surface at wall particle
+b, which has the weight s_b. The vector r leads to particle i from the body's middle c'. The surface point is at c' + r
+- y_b and has the velocity V + W x (r - y_b), with the body's velocity V and angular velocity W. The effect of the body
+on particle i follows from three sums over wall particles,
 
     H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
 
-and from z = v_i - V - W x r. The body adds terms to the sums M_i, R_i and A_i of `cortado.sph.stress_kernels`: N to
-M_i, tr N / mu_i to R_i, and z Y^T + [W] N to A_i. [W] is the matrix of the cross product with W. With the stress T_i,
-the damping C and the viscosity mu_i, the acceleration a_i and its couple c_i about the particle are
+and from z = v_i - V - W x r. The body adds N to M_i, tr N / mu_i to R_i, and z Y^T + [W] N to A_i, which are sums of
+`cortado.sph.stress_kernels`. [W] is the matrix of the cross product with W. With the stress T_i, the damping C and the
+viscosity mu_i, the acceleration a_i and its couple c_i about the particle are
 
     m_i a_i = -(T_i Y + C mu_i (H z + W x Y)),
     m_i c_i = -(ax(T_i N) + C mu_i (Y x z + (tr N - N) W)),   ax(B) = (B_zy - B_yz, B_xz - B_zx, B_yx - B_xy).
 
 The body gets the force F = -sum_i m_i a_i and the torque -sum_i m_i (r x a_i - c_i) about c'. Force and torque are
 minus half the derivatives of the dissipation with respect to V and W. Momentum and angular momentum are conserved, and
-rigid rotation of body and fluid together dissipates nothing.
+a common rigid rotation of body and fluid dissipates nothing.
 """
 
 from functools import cache

@@ -1,8 +1,8 @@
 """The mass fractions, rest density and viscosity of particles in a mixture. `docs/discretisation.md` has the equations.
 
-The viscosity is the exponential of a mean of logarithms (Arrhenius 1887), and stays positive if mass fractions leave
-the range from 0 to 1. Phases diffuse at the start of a step, with particles at fixed positions. Particles then get new
-densities and viscosities, but keep their masses.
+The logarithm of the viscosity is a mean over the phases (Arrhenius 1887), so that the viscosity stays positive if mass
+fractions leave the range from 0 to 1. Phases diffuse between fixed particles at the start of a step. Diffusion changes
+the densities and viscosities of particles, but not the masses.
 """
 
 from contextlib import nullcontext

@@ -1,7 +1,7 @@
 """The second moment matrix of a particle's neighbours, and the fullness of the neighbourhood.
 
-The inverse of the matrix corrects gradients (Bonet and Lok 1999). The fullness is a number from the invariants of the
-matrix: 1 inside the fluid, about 0.6 at a flat surface, and 0 if neighbours lie on a line or are missing.
+The inverse of the moment matrix corrects gradients (Bonet and Lok 1999). The fullness is a number from the invariants
+of the matrix: 1 inside the fluid, about 0.6 at a flat surface, and 0 if neighbours lie on a line or are missing.
 """
 
 from functools import cache

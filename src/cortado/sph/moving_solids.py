@@ -4,8 +4,8 @@ A free body changes its velocity only along free axes, and its angular velocity 
 turns about the hinge: its inertia and its angular momentum are about the hinge, and its centre of mass moves with the
 rotation.
 
-A solid with a prescribed path starts at its initial pose, and is displaced and turned by the path. The velocity of a
-wall particle is its displacement in a step divided by the time step.
+A prescribed path displaces and turns a solid from its initial pose. A wall particle has the velocity of its
+displacement in a step divided by the time step.
 
 A rotation is a rotation vector (Rodrigues) in 3-D, and an angle in 2-D. If the rotation vector w changes by a small
 vector u, the rotation is followed by the small rotation J u with the Jacobian

@@ -2,7 +2,7 @@
 
 `Body` is an acceleration of each particle. `Pair` is a force between neighbours, which is multiplied by the smoothing
 kernel and therefore ends smoothly at the support radius. `Rheology` is the viscosity of a generalised Newtonian fluid.
-Tangents and adjoints are exact, from Warp's derivatives of the function.
+Warp computes exact tangents and adjoints from the function.
 """
 
 from abc import ABC, abstractmethod

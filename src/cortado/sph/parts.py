@@ -1,12 +1,12 @@
 """The parts of a step, such as forces, the mixture and emitters, and the order of their methods.
 
-A part reads the sorted particles and the parameters, and must not overwrite them. It can accelerate particles, keep
+A part reads the sorted particles and the parameters, and must not overwrite them. A part can accelerate particles, keep
 fields from step to step, and act at the beginning and end of a step. A part may omit any method.
 
-A step calls each method for all parts, one part after the other; reverse mode uses the reverse order. In `begin`,
-kernels can read the parameters and the number of the step. From `sort` on they can also read positions, velocities and
-masses, from `settle` on neighbours and densities, and in `end` all arrays of the step. A derivative repeats a step
-without `end`. The earlier methods must therefore store all values that tangent or adjoint need.
+A step calls each method for all parts in turn, and reverse mode uses the reverse order. In `begin`, kernels can read
+the parameters and the number of the step. From `sort` on, kernels can also read positions, velocities and masses. From
+`settle` on, kernels can also read neighbours and densities. In `end`, kernels can read all arrays of the step.
+Derivatives repeat a step without `end`, so the earlier methods must store all values that tangent or adjoint need.
 
 A state stores particles in the order of the scene, and a step works on sorted particles. At the end of this module are
 the kernels of time integration (semi-implicit Euler) and of sorting, with derivatives.

@@ -5,16 +5,16 @@ A spring connects a point of a free body to a point of a second solid, or to a p
     t = k (l - l_0) + C u,
 
 with the stiffness k, the length l, the rest length l_0, the damping C, and the rate of extension u. A slack spring only
-pulls: its tension is at least 0. The body gets the momentum of the tension in a time step, and the second solid gets
-the opposite momentum. Forces use the poses at the start of a step, and the new velocities then move the bodies
+pulls, with a tension of at least 0. The body gets the momentum of the tension in a time step, and the second solid gets
+the opposite momentum. Spring forces use the poses at the start of a step, and the new velocities then move the bodies
 (symplectic Euler). Without damping, the time step must be at most 2 / omega for a spring of angular frequency omega.
 
-A body that is turned by the angle phi about a hinge gets the torque
+A spring and a motor at a hinge give a body, turned by the angle phi about the hinge, the torque
 
     T - k (phi - phi_0) - C (r - s),
 
 with the motor's torque T, the stiffness k, the rest angle phi_0, the damping C, the angular velocity r about the hinge,
-and the motor's speed s. The second solid gets the opposite torque. At half a turn phi jumps from pi to -pi.
+and the motor's speed s. The second solid gets the opposite torque. At half a turn, the angle phi jumps from pi to -pi.
 """
 
 from collections.abc import Iterator, Sequence

@@ -7,12 +7,13 @@ s_w:
     y_ib = d n,   s_w = w_b s_ib max(n . x_ib, 0) / max(d, e),
 
 where s_ib is the weight of two fluid particles at the same distance. With the weight s_w, the wall acts as if
-velocities continued behind the wall with opposite sign (Morris, Fox and Zhu 1997). The distance d is 0 behind the
-surface. Below the distance e, called ``least``, the pull of a wall does not increase further.
+velocities continued behind the wall with opposite sign (Morris, Fox and Zhu 1997). The distance d is 0 for a particle
+behind the surface. Below the distance e, called ``least``, the pull of a wall does not increase further.
 
-The product n . x_ib is negative if b belongs to the other side of a thin wall, or to another face at an edge. Such wall
-particles are left out, because a negative weight would accelerate the particle. The derivative jumps where d is 0,
-where d is e, and where n . x_ib is 0. The normal n comes from the ``foot``, the vector from x_b to the surface.
+The product n . x_ib is negative if b belongs to the other side of a thin wall, or to another face at an edge. Wall
+particles with a negative product are left out, because a negative weight would accelerate particle i. The derivative of
+s_w jumps where d is 0, where d is e, and where n . x_ib is 0. The normal n comes from the ``foot``, the vector from x_b
+to the surface.
 
 A viscosity law returns the viscosity of a fluid from its shear rate. The law is a user's function, a law named in a
 scene (`cortado.scene.model`), or the constant of a Newtonian fluid.

@@ -1,29 +1,29 @@
 """Kernels of the viscous force as the divergence of a stress. `docs/discretisation.md` has the equations.
 
-The kernel gradient is a x, so that the weight s_ij = -V a_ij of a pair is not negative. The sums of particle i over its
-neighbours are
+A pair with the separation x has the kernel gradient a x, so that its weight s_ij = -V a_ij is not negative. The sums of
+particle i over its neighbours are
 
     M_i = sum_j s_ij x_ij x_ij^T,   A_i = sum_j s_ij v_ij x_ij^T,   R_i = sum_j s_ij |x_ij|^2 / mu_j.
 
 The velocity gradient G = A M^-1 is also the least-squares fit to the velocities of the neighbours with weights s_ij.
-The force on a particle is minus half the derivative of the dissipation
+The viscous force on a particle is minus half the derivative of the dissipation
 
     sum_i mu_i (2 D_i : D_i + C sum_j s_ij |v_ij - G_i x_ij|^2)
 
-with respect to the particle's velocity, so that the force never adds energy. The force is 0 in rigid rotation, so that
-momentum and angular momentum are conserved.
+with respect to the particle's velocity, so that the viscous force never adds energy. The viscous force is 0 in rigid
+rotation, so that momentum and angular momentum are conserved.
 
 `stress_of_particle` computes the viscosity mu = S law(sqrt(2 D : D), mu_m) from the sums of one particle. The argument
-mu_m is the harmonic mean of the viscosities of the particle and its neighbours. With this mean, the shear stress is
-equal on both sides of an interface. For a Newtonian fluid the law returns mu_m.
+mu_m is the harmonic mean of the viscosities of the particle and its neighbours. With a harmonic mean, the shear stress
+is equal on both sides of an interface. For a Newtonian fluid the law returns mu_m.
 
 The factor S is 1 if neighbours lie on all sides or on one side. The factor S falls smoothly to 0 if neighbours lie on a
 line or are missing, because the matrix M then has no inverse. With the invariants I_2 and I_3 of M,
 
     H = 3 I_3 / I_2 (in 2-D 2 det M / tr M),   S = smoothstep((H - 0.2) / 0.3).
 
-Where S is positive, the determinant of M is at least 0.008, so that M has an inverse. Users' functions may take
-velocity gradients S G, whose sums include fluid alone.
+If S is positive, the determinant of M is at least 0.008, so that M has an inverse. User-defined functions may read
+velocity gradients S G, whose sums exclude walls.
 """
 
 from collections.abc import Callable

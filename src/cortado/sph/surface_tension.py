@@ -2,14 +2,14 @@
 
 `docs/discretisation.md` has the equations of the stress (continuum surface stress, Lafaurie et al. 1994). The surface
 normal points out of the fluid. The factor 1 / N makes the normal's length 1 in the outermost layer of a cut lattice,
-and about 0 inside the fluid. The stress S pulls along the surface. With `PART` below 1, the stress also pulls a little
+and about 0 inside the fluid. The stress S pulls along the surface. If `PART` is below 1, the stress also pulls a little
 across the surface, so that particles do not detach. The force of a pair grows with distance up to 0.65 h, so that
 particles of the surface do not clump. The divisor Gamma is `RELAXED` times the surface tension that a cut lattice would
 have for sigma / Gamma = 1.
 
-The forces of a pair are opposite, but not parallel to the pair, so that only momentum is exactly conserved. Neither of
-the two kinds of surface tension is the gradient of an energy. Fluids with very low viscosity therefore gain energy; see
-`LEAST_VISCOSITY`.
+The stress conserves only momentum exactly, because the forces of a pair are opposite, but not parallel to the pair.
+Neither the curvature force nor the stress is the gradient of an energy. Fluids with very low viscosity therefore gain
+energy; see `LEAST_VISCOSITY`.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,8 @@
 """The solve of the implicit viscous stress by conjugate gradients (Hestenes and Stiefel 1952).
 
-The unknowns are vectors of particles and a few numbers of each free body. The matrix is symmetric and positive definite
-in the scalar product weighted with masses. Each scene of a batch iterates until its residual has fallen to round-off.
+The unknowns are one vector for each particle and a few numbers for each free body. The matrix is symmetric and positive
+definite in the scalar product weighted with masses. Each scene of a batch iterates until its residual has fallen to
+round-off.
 """
 
 from functools import cache

@@ -1,14 +1,15 @@
 """The viscous force as a stress (`cortado.sph.stress_kernels`), which is either explicit or implicit.
 
 The implicit force does not limit the time step. Let a be the acceleration by all other forces, and g(v) the
-acceleration by the viscous stress of fluid with velocities v. The viscosity mu and the matrix M in g belong to the
-start of the step. The acceleration a' at the end of a step solves
+acceleration by the viscous stress of fluid with velocities v. The function g uses the viscosity mu and the matrix M
+from the start of the step. The acceleration a' at the end of a step solves
 
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y).
 
 `cortado.sph.viscous_solve` solves this equation to round-off. The operator B is symmetric and positive in the product
-sum_i m_i a_i . b_i. The viscosity mu is computed from the velocities v at the start, and the stress from u = v + dt a'
-at the end. Derivatives are those of the exact solution: the tangent and the adjoint each need one more solve with B.
+sum_i m_i a_i . b_i. The viscosity mu belongs to the velocities v at the start of the step, and the stress to u = v + dt
+a' at its end. Derivatives are exact for the solved equation: the tangent and the adjoint each need one more solve with
+B.
 """
 
 from collections.abc import Sequence

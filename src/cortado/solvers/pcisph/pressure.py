@@ -1,9 +1,9 @@
 """One pressure iteration of PCISPH (Solenthaler and Pajarola 2009). `docs/discretisation.md` has the equations.
 
-Kernel gradients and neighbour lists belong to the positions at the start of the step. The pressure force, including the
-force of walls, is the transpose of the derivative of the number density n with respect to positions. Moving particles
-against the force therefore takes the work V sum_i c_i dn_i with c = p / n^2. The derivative of max(p, 0) is 1 if p is
-positive, and 0 otherwise.
+The iteration uses kernel gradients and neighbour lists from the start of the step. The pressure force, including the
+force of walls, is the transpose of the derivative of the number density n with respect to positions. A displacement
+against the pressure force therefore takes the work V sum_i c_i dn_i with c = p / n^2. The derivative of max(p, 0) is 1
+if the pressure p is positive, and 0 otherwise.
 """
 
 from functools import cache

@@ -1,16 +1,15 @@
 """PCISPH (Solenthaler and Pajarola 2009): steps with tangent and adjoint, and two factors on the pressure correction.
-
 `docs/discretisation.md` has the equations.
 
-*Density ratios*: The pressure correction assumes particles of equal mass, but a pressure moves lighter neighbours
-further. The iteration diverges if a density changes by more than twice the wanted amount. The density-ratio relaxation
-is 1 among particles of equal or greater mass. For a large sum t over lighter neighbours, the density-ratio relaxation
-tends to 1 / (1 + t / 2), the value for a lattice.
+*Density ratios*: The pressure correction assumes neighbours of equal mass, but a pressure moves lighter neighbours
+further. The pressure iteration diverges if a correction changes a density by more than twice the wanted amount. The
+density-ratio relaxation, a factor on the correction, is 1 among particles of equal or greater mass. For a large sum t
+over lighter neighbours, the density-ratio relaxation tends to 1 / (1 + t / 2), the value for a lattice.
 
-*Walls*: The pressure correction assumes a particle with a filled neighbourhood. Beside a wall, the same pressure
-changes the density of the particle more. A particle that approaches a wall then meets a steeper gradient, so the wall
-relaxation doubles the change by walls. The wall relaxation changes the rate of convergence, not the limit. Gradients
-are scaled before they are squared, because the square of a gradient overflows in float32 for small spacings.
+*Walls*: The pressure correction assumes a filled neighbourhood, but beside a wall the same pressure changes the density
+more. A particle that approaches a wall also meets a steeper kernel gradient, so the wall relaxation doubles the density
+change by walls. The wall relaxation changes the rate of convergence, but not the converged pressure. Kernel gradients
+are scaled before they are squared, because their squares overflow in float32 for small spacings.
 """
 
 from collections.abc import Sequence

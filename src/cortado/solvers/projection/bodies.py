@@ -1,21 +1,21 @@
-"""A rigid body in the projection: pressures change the body's velocities as they change velocities of fluid.
+"""A rigid body in the projection: pressures change the velocities of the body and of the fluid.
 
 The walls of a body push particle i in proportion to the vector
 
     gamma_i = sum w_b (N_b g_ib + e_i (g_ib - N_b g_ib)),   N_b = n_b n_b^T.
 
-The sum is over the wall particles b of the body. Wall particle b has the weight w_b, the normal n_b and the kernel
-gradient g_ib. The factor e_i is computed from all walls (`cortado.solvers.projection.wall_sums`). Pressure impulses y
-give the body the velocity V, the angular momentum L and the angular velocity W:
+Each wall particle b of the body adds a term with its weight w_b, its normal n_b and its kernel gradient g_ib. The edge
+factor e_i is computed from all walls (`cortado.solvers.projection.wall_sums`). Pressure impulses y give the body the
+velocity V, the angular momentum L and the angular velocity W:
 
     V = V_0 + dt g + sum y_i gamma_i / (rho K),   L = L_0 + sum y_i r_i x gamma_i,   W = R' I^-1 R'^T L / rho
 
-Here r_i = x_i - c' is the arm of particle i, rho the density of the body, and K its volume in units of a particle's
-volume. This map is the transpose of the body's term in the divergence, - gamma_i . (V + W x r_i). The sum over all
-walls already contains the part of this term from the wall velocity (V_0, W_0). For a body with restricted motion,
+Particle i has the arm r_i = x_i - c'. The body has the density rho, and its volume is K particle volumes. The map from
+y to V and W is the transpose of the body's term in the divergence, - gamma_i . (V + W x r_i). The sum over all walls
+already contains the part of the body's term from the wall velocity (V_0, W_0). For a body with restricted motion,
 smaller matrices replace 1 / (rho K) and R' I^-1 R'^T (`cortado.sph.moving_solids`).
 
-All particles around a light body move the body. The diagonal a_i of the iteration therefore gets the term
+All particles around a light body move the body. The diagonal a_i of the pressure iteration therefore includes the term
 
     |gamma_i| sum_j |gamma_j| / (rho K) + lambda |r_i x gamma_i| sum_j |r_j x gamma_j| / rho
 

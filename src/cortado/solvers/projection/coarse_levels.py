@@ -1,15 +1,15 @@
-"""A multigrid method for the coarse grid of the pressure, with which solves take few iterations.
+"""A multigrid method that solves for the pressure on the coarse grid in few iterations.
 
-A level has half of the nodes of the finer level along every axis with an even number of nodes. The matrix of a level is
-R A R^T (Galerkin), where A is the matrix of the finer level and R is bilinear. Like A, the matrix R A R^T is a sum over
-cells. The solve (`cortado.solvers.projection.coarse_solve`) smooths a solution x by Jacobi steps x + w (r - A x). Here
-r is the right-hand side, and w contains the weight of each node I:
+Along every axis with an even number of nodes, a level has half of the nodes of the finer level. The matrix of a level
+is R A R^T (Galerkin), with the matrix A of the finer level and a bilinear restriction R. Like A, the matrix R A R^T is
+a sum over cells. The solve (`cortado.solvers.projection.coarse_solve`) smooths a solution x by Jacobi steps x + w (r -
+A x) with the right-hand side r. Node I has the Jacobi weight
 
     w_I = W / (sqrt(A_II) sum_J |A_IJ| / sqrt(A_JJ)).
 
 If the factor W is below 2, Jacobi's method converges for every symmetric positive semidefinite matrix. With W = 1, the
-product w A has no eigenvalue above 1. Baker, Falgout, Kolev and Yang (2011) give this bound, which is applied to the
-matrix with its diagonal scaled to 1.
+product w A has no eigenvalue above 1. The bound by Baker, Falgout, Kolev and Yang (2011) is applied to the matrix with
+its diagonal scaled to 1.
 """
 
 from functools import cache

@@ -1,7 +1,7 @@
 """Hat functions of the nodes of a grid, and sums over the particles around nodes.
 
-The hat function of a node is 1 at the node and falls linearly along each axis to 0 at the next nodes. The grid is the
-grid of a `CellSort`. Node number k is at the lower corner of cell number k.
+The hat function of a node is 1 at the node and falls linearly along each axis to 0 at the next nodes. The nodes are the
+lower corners of the cells of a `CellSort`, and a node has the number of its cell.
 """
 
 from functools import cache

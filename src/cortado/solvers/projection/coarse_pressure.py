@@ -1,21 +1,21 @@
 """A pressure on a coarse grid of hat functions phi_I, one at each node of a `CellSort`'s grid.
 
-`docs/projection_step.md` has the equations. The share c of each particle is from `cortado.solvers.projection.effects`.
-The moment N and the push h are from `cortado.solvers.projection.coarse_push`.
+`docs/projection_step.md` has the equations. `cortado.solvers.projection.effects` computes the share c of each particle.
+`cortado.solvers.projection.coarse_push` computes the moment N and the push h.
 
-Two operations transfer values between nodes and particles. At a node I, the operation `spread` sums
+The operation `spread` transfers values s, t, R and o from particles to nodes. The result at node I is the sum of
 
     phi_I s_i + grad phi_I . t_i + hess phi_I : R_i + e_I o_i
 
-over the particles i of the cells around the node, in the order of the particles. The operation `at` gives a node
-array's value E at a particle, its gradient G and its mixed second derivatives. With w = (N G + h E) / m, the product A
-e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m.
+over the particles i of the cells around the node, in the order of the particles. The operation `at` interpolates a node
+array at a particle, and returns the value E, the gradient G and the mixed second derivatives. The product A e of the
+matrix A and a node array e is `spread` of s = h . w, t = N^T w and o = (eps + h^2 / 100) / m, with w = (N G + h E) / m.
 
 Free bodies add B^T B to the matrix A, with
 
     B_I = (F_I / sqrt(rho K), S R'^T T_I / sqrt(rho)),   S S = I^-1.
 
-Here F_I and T_I are a body's momentum and angular momentum by the pressure impulses phi_I c
+The pressure impulses phi_I c give a body the momentum F_I and the angular momentum T_I
 (`cortado.solvers.projection.bodies`). For each body, B has three rows in 2-D and six rows in 3-D. For a body with
 restricted motion, the smaller matrices of `cortado.sph.moving_solids` replace 1 / (rho K) and I^-1.
 """

@@ -1,12 +1,12 @@
-"""The force of a smooth coarse pressure on a particle, and the divergence that this pressure has to remove.
+"""The force of a smooth coarse pressure on a particle, and the divergence that the coarse pressure has to remove.
 
-For a linear function phi, let particle j have the pressure c_j phi(x_j). The force on particle i is then exactly
+Let each particle j have the pressure c_j phi(x_j), with a linear function phi. The pressure force on particle i is then
 
     N_i grad phi + phi(x_i) h_i,   h = D^T c,
 
-with the moment N and the operator D of `docs/projection_step.md`. The push h is the force of the constant pressure c.
-The matrix T is c L, with the gradient correction L. Inside the fluid and beside mirroring walls, N is the unit matrix
-and h is 0. Beside wall particles, N and h have other values.
+with the moment N and the operator D of `docs/projection_step.md`. The push h is the pressure force for phi = 1. The
+code also names T = c L, with the gradient correction L. Inside the fluid and beside mirroring walls, N is the unit
+matrix and h is 0, but N and h have other values beside wall particles.
 """
 
 from functools import cache

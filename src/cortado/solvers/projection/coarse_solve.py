@@ -1,11 +1,11 @@
 """Solves the equations of the coarse pressure in one kernel launch.
 
-The method is conjugate gradients (Hestenes and Stiefel 1952) with a multigrid cycle as preconditioner
-(`cortado.solvers.projection.coarse_levels`). The multigrid cycle does not include rigid bodies.
+The solver uses conjugate gradients (Hestenes and Stiefel 1952) with a multigrid cycle as preconditioner
+(`cortado.solvers.projection.coarse_levels`). The multigrid cycle ignores rigid bodies.
 
-CPUs and GPUs run the same C++ source. On a CPU, one thread solves for a scene. On a GPU, a team of blocks solves for a
-scene, and blocks wait for each other at barriers. Results do not depend on the number of blocks, because sums are made
-of partial sums over `BLOCK` nodes.
+CPUs and GPUs run the same C++ source. On a CPU, one thread solves the equations of a scene. On a GPU, a team of thread
+blocks solves the equations of a scene, and the blocks wait for each other at barriers. Results do not depend on the
+number of blocks, because sums are made of partial sums over `BLOCK` nodes.
 """
 
 from functools import cache

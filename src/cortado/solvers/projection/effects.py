@@ -1,15 +1,15 @@
 """Weights and gradient corrections of a particle in the projection, and images of the fluid in flat mirroring walls.
 
-`docs/projection_step.md` has the equations. M, Q and g are the moments of `cortado.solvers.projection.sums`, and gamma
-and nu are the sums of `cortado.solvers.projection.wall_sums`. With a smoothstep S of the fullness H, `weights` are
+`docs/projection_step.md` has the equations. `cortado.solvers.projection.sums` computes the moments M, Q and g, and
+`cortado.solvers.projection.wall_sums` computes the sums gamma and nu. `weights` uses a smoothstep S of the fullness H:
 
     sigma = S(0.1, 0.5) B          the part of tension that is admitted,
     f = S(0.1, 0.5) of H + nu      the part of the previous step's pressure with which a step begins,
     u = S(0.5, 0.8)                the part of the shift that is applied,
     r = S(0.8, 0.95) B             the part of a low density that is repaired.
 
-The diagonal of the projection's matrix is a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m, with the value a_0 on the
-lattice.
+The projection's matrix has the diagonal a = |L g + gamma|^2 / m + tr(L Q L) + 0.05 a_0 / m, where a_0 is the diagonal
+on the lattice.
 """
 
 from functools import cache

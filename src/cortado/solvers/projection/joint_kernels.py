@@ -1,21 +1,21 @@
 """Hinges between free bodies and other solids in a step of the projection, with derivatives.
 
-A hinge keeps a point of a body A at a point of another solid B. In A's frame the point is at a. The vector from A's
-middle to the point is then R a at the start of a step, and R' a at the predicted pose of A. At the end of the step, the
-velocity changes V - V_0 and angular velocity changes W - W_0 (`cortado.sph.free_solids`) must satisfy
+A hinge keeps a point of a body A at a point of another solid B. The hinge point is at a in A's frame. The vector from
+A's middle to the hinge point is R a at the start of a step, and R' a at the predicted pose of A. At the end of the
+step, the velocity changes V - V_0 and angular velocity changes W - W_0 (`cortado.sph.free_solids`) must satisfy
 
     b = (V - V_0)_A + (W - W_0)_A x R'_A a_A - (the same of B) + (p'_A - p'_B) / dt = 0.
 
-Here p' = c' + R' a is the predicted position of each point. For this purpose A gets the momentum lambda at R_A a_A, and
-B gets -lambda. Momentum and angular momentum are therefore conserved. The remaining gap is of the order of dt^4, and
-the next step removes it. In 3-D a hinge with the axis n also fixes two of the three relative angles. With P = I - n
-n^T, A gets the angular momentum P lambda and B gets -P lambda, so that
+Each solid predicts the hinge point at p' = c' + R' a. The hinge gives A the momentum lambda at R_A a_A, and gives B the
+momentum -lambda. The hinge therefore conserves momentum and angular momentum. The gap p'_A - p'_B that remains is of
+the order of dt^4, and the next step removes the gap. In 3-D a hinge with the axis n also fixes two of the three
+relative angles. With P = I - n n^T, A gets the angular momentum P lambda and B gets -P lambda, so that
 
     b = P ((W - W_0)_A - (W - W_0)_B) + n x (n'_A - n'_B) / dt = 0.
 
-All vector equations together are the linear system b = b_0 + K lambda = 0 with 3 x 3 blocks K_kl. Equations k and l are
-coupled if they contain the same body. For each pressure, a step solves K lambda = -b_0 once by block elimination. A
-solid with a prescribed motion gets no momentum. The coarse grid of the pressure is approximate and ignores hinges.
+The vector equations of all hinges are the linear system b = b_0 + K lambda = 0 with 3 x 3 blocks K_kl. Equations k and
+l are coupled if both contain the same body. For each pressure, a step solves K lambda = -b_0 once by block elimination.
+A solid with a prescribed motion gets no momentum. The coarse grid of the pressure is approximate and ignores hinges.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
-"""Values from a step of the projection: the pressure that a gauge reads, and the forces on mirroring walls.
+"""The pressure that a sensor reads after a step of the projection, and the forces on mirroring walls.
 
-`docs/projection_step.md` has the equation of the pressure. Kernels divide impulses, which are k or dt p, by the time
-step.
+`docs/projection_step.md` has the equation of the pressure. Kernels divide the impulses k and dt p by the time step.
 
-On mirroring walls, the forces of images replace the fraction h of the forces on wall particles. The change of the force
-is the sum over the images by one solid or by all walls
+On mirroring walls, the forces of images replace the fraction h of the forces on wall particles. The force on one solid,
+or on all walls, changes by the sum over its images
 
     sum (h_i p_i + h_j p_j) g_i' - h_i p_i gamma_m
 

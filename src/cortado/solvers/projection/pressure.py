@@ -1,9 +1,9 @@
 """The pressures of the projection, by accelerated Jacobi iterations that admit only part of the tension.
 
-`docs/projection_step.md` has the equations. A scene is shut if it has no free surface: the weight of the coarse
-pressure is then positive for every particle. In a shut scene tension is also admitted beside walls, because fluid that
-fills a container cannot leave the walls. A scene is warm if any particle begins with a pressure, and cold if no
-particle does. In a cold scene a coarse correction also precedes the first iteration.
+`docs/projection_step.md` has the equations. A scene without a free surface is called shut: the weight of the coarse
+pressure is positive for every particle. In a shut scene tension is also admitted beside walls, because fluid that fills
+a container cannot leave the walls. A scene is called warm if any particle begins with a pressure, and otherwise cold.
+In a cold scene a coarse correction also precedes the first iteration.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Repairs of the density, by Jacobi iterations that change only positions.
 
-`docs/projection_step.md` has the equations. Kernel gradients, wall sums and the diagonal are from the start of the
-step. Only the number density is computed at the moved positions, over the neighbours from the start of the step.
+`docs/projection_step.md` has the equations. Repairs use kernel gradients, wall sums and the diagonal from the start of
+the step. Only the number density is computed at the moved positions, over the neighbours from the start of the step.
 Repairs do not change velocities, because a repair would then act a second time in the next step.
 """
 

@@ -1,19 +1,19 @@
-"""Keeps particles on their side of a sheet: a particle that ends a step on the other side is moved back.
+"""Keeps particles on their side of a sheet, and moves back a particle that ends a step on the other side.
 
 In the frame of a sheet a particle is at y_0 before the step and at y after the step. A face of the sheet has the normal
-n and contains a point a. The height of the particle above the face is h = n . (y - a), and h_0 before the step. The
+n and contains a point a. The particle is at the height h = n . (y - a) above the face, and at h_0 before the step. The
 path from y_0 to y may cross the face, or end nearer to the face than e = s / 20 with the spacing s. The particle is
 then put back on the side of y_0:
 
     y' = y + (e sign h_0 - h) n.
 
-This is done up to three times, each time with the face that the path meets first. If the path still crosses the sheet,
-as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0.
+A particle is put back up to three times, each time by the face that the path meets first. If the path still crosses the
+sheet, as in a sharp corner, the particle keeps its place relative to the sheet, y' = y_0.
 
 For derivatives, let the middle c of the solid move by c', and let the solid turn by the small vector w' and grow by the
 relative amount g' (`MovingWalls`). A point x of the solid then moves by t(x) = c' + w' x (x - c) + g' (x - c). A
-particle that moves by x' moves by D = x' - t(x) relative to the solid. With the normal N of the face in the scene, D
-becomes D - N (N . D + e sign h_0 g'), and then t is added again.
+particle that moves by x' moves by D = x' - t(x) relative to the solid. If the face has the normal N in the scene, the
+correction changes D to D - N (N . D + e sign h_0 g'), and then adds t again.
 """
 
 from functools import cache

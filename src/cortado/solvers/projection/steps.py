@@ -1,7 +1,8 @@
 """A step of the projection: pressures that remove divergence, a shift of particles, and repairs of the density.
 
-`docs/projection_step.md` has the equations of the pressure, the shift delta and the repairs. With ``velocities_follow``
-velocities follow, to first order, the positions after the shift and the repairs (Xu, Stansby and Laurence 2009):
+`docs/projection_step.md` has the equations of the pressure, the shift delta and the repairs. With
+``velocities_follow``, velocities change to first order with the positions in the shift and the repairs (Xu, Stansby and
+Laurence 2009):
 
     v' = v - A (1.05 (M + 0.05 I)^-1) (x_K - x - dt v),   A = sum_j v_ij g_ij^T,
 

@@ -1,4 +1,4 @@
-"""Sums over neighbours in the projection, and velocities under pressures, with derivatives."""
+"""Sums over neighbours in the projection, and the velocities that pressures cause, with derivatives."""
 
 from functools import cache
 from types import SimpleNamespace

@@ -1,12 +1,12 @@
 """Sums over walls for the force of walls on a particle in the projection, with derivatives.
 
 `docs/projection_step.md` has the equations. The code names gamma_n ``normal`` and gamma_w ``whole``, so that gamma =
-normal + e (whole - normal) with the edge factor e. For moving walls with velocities v_b, the drifts are sum w_b (n_b
+normal + e (whole - normal) with the edge factor e. The drifts of moving walls with velocities v_b are sum w_b (n_b
 n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The pressure of a particle pushes the walls of one solid s along gamma_s / V,
 
     gamma_s = normal_s + e (whole_s - normal_s).
 
-The sums normal_s and whole_s are over the wall particles of the solid, and e is from the sums over all walls.
+The sums normal_s and whole_s are over the wall particles of solid s. The edge factor e is computed from all walls.
 
 Flat faces of moving solids act through images of the fluid instead of wall particles. In reverse mode a sum over images
 is a work W that is linear in adjoints,
@@ -14,10 +14,10 @@ is a work W that is linear in adjoints,
     W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R (u_j + B_j x_ij)) . g_i' + e_i swept . g_i' / dt
                - 1/2 h_i k_i (q_i + q_j) x_i' . g_i').
 
-Here h, b, c, d and e are the arrays ``image``, ``density``, ``weighted``, ``spread`` and ``swept`` of `NUMBERS`. W_i',
-g_i' and x_i' are the kernel, its gradient and the separation for an image, and R is the reflection. B is the slope of
-the push by a coarse pressure. Warp differentiates W with respect to the poses of the solid before and after the step.
-Gradients with respect to particle positions are in other modules, except the part through the edge factor e.
+`NUMBERS` names h, b, c, d and e ``image``, ``density``, ``weighted``, ``spread`` and ``swept``. An image in the
+reflection R has the kernel W_i', the kernel gradient g_i' and the separation x_i'. The matrix B is the slope of the
+push by a coarse pressure. Warp differentiates W with respect to the poses of the solid before and after the step. Other
+modules compute gradients with respect to particle positions, except the part through the edge factor e.
 """
 
 from collections.abc import Iterator, Mapping
