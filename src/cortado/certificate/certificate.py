@@ -46,7 +46,8 @@ ROUGHLY = 0.1
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: whether gradients are right and for how many steps, and which estimator to use."""
+    """The result of `certify`: whether gradients are right, for how many steps gradients are useful, and which
+    estimator to use."""
 
     particles: int
     steps: int
@@ -157,7 +158,7 @@ def certify(
     """Check the gradients of a problem or a scene in float64.
 
     A float32 problem is rebuilt in float64 on the same device, because round-off would hide errors. A user-defined loss
-    is still computed in float32. The adjoint of such a loss may differ from its finite differences by 10 %.
+    is still computed in float32. The adjoint of a user-defined loss may differ from its finite differences by 10 %.
 
     The adjoint is checked with respect to all parameters of the scene. The horizon and the recommended estimator are
     computed for ``parameters`` only. The horizon is the number of steps up to which the exact gradient is useful.
@@ -272,7 +273,7 @@ def _consistency(
 def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> tuple[Consistency | None, int]:
     """Check the derivatives at a randomly changed initial state. Also return the number of checked steps.
 
-    The loss of fluid at rest may have a corner, as |v| has at v = 0. The adjoint there is a one-sided derivative.
+    The loss of fluid at rest may have a corner, as |v| has at v = 0, where the adjoint is a one-sided derivative.
     """
     known = problem.simulation.known
     states = {n: v for n, v in values.items() if known[n].role is Role.STATE and known[n].range is Range.ANY}

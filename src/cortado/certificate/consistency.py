@@ -106,8 +106,8 @@ class LossHistory:
         self._total = np.cumsum if frames else np.asarray
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return central differences of the loss, and distances between one-sided differences, both (sample_steps,).
-        Central differences are NaN after a run diverges. The distances are 0 for float32 losses."""
+        """Return central differences of the loss, and distances between one-sided differences, as two arrays
+        (sample_steps,). Central differences are NaN after a run diverges. The distances are 0 for float32 losses."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)
@@ -222,7 +222,7 @@ class Consistency(ShortRepr):
     tangents: np.ndarray
     """Directional derivatives (sample_steps,) by forward mode."""
     differences: np.ndarray
-    """Central differences (tried, sample_steps). They are not computed if reverse and forward mode disagree."""
+    """Central differences (tried, sample_steps), which are not computed if reverse and forward mode disagree."""
     sides: np.ndarray
     """Distances (tried, sample_steps) between the forward and the backward difference, for each tried step size."""
     steps: np.ndarray
@@ -286,7 +286,7 @@ class Consistency(ShortRepr):
         return self.disagreement < MODE_TOLERANCE and self.differences_agree
 
     def _worst(self, distances: np.ndarray) -> np.ndarray:
-        """Divide by the size of the differences. Both are the greatest numbers up to each sample step."""
+        """Divide the greatest distance up to each sample step by the greatest central difference up to the step."""
         size = np.maximum.accumulate(np.abs(self.differences[len(self.differences) - len(distances) :]), axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.nan_to_num(np.maximum.accumulate(distances, axis=1) / size, nan=np.inf, posinf=np.inf)

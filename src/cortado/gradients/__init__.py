@@ -29,7 +29,7 @@ def estimate(
     """Return the loss of a problem, and its gradient computed by an estimator. The default estimator is `Exact`.
 
     ``parameters`` are values by name. ``observe`` is called with the number and the adjoint of each state. Raises
-    `InputError` if ``estimator`` is not an estimator, or if its result lacks the gradient of a parameter.
+    `InputError` if ``estimator`` is not an estimator, or if the result lacks the gradient of a parameter.
 
     Example::
 

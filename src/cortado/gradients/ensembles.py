@@ -310,9 +310,9 @@ class Guided(Ensemble):
         g = sum_k D_k p_k,   D_k = mean over samples of (L(u + r_k p_k) - L(u - r_k p_k)) / (2 r_k),   r_k = sqrt(N_k),
 
     where L is the loss, u are the parameters, and N_k is the number of non-zero components of part k. The two losses of
-    a difference have the same perturbed initial positions. g is therefore the projection of the smoothed gradient onto
-    the span of the parts. Source: guided evolution strategies (Maheswaranathan et al. 2019), without their search
-    outside the span.
+    a difference have the same perturbed initial positions. The gradient g is therefore the projection of the smoothed
+    gradient onto the span of the parts. Source: guided evolution strategies (Maheswaranathan et al. 2019), without the
+    search outside the span of the parts.
 
     Bias: directions outside the span of the parts are missed. The size of each part is correct for the smoothed loss.
     Noise: the ``standard_error`` combines the errors of D_k and p_k, with degrees of freedom by Welch and

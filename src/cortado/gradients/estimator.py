@@ -34,7 +34,7 @@ class Estimate:
     left_out: int = 0
     """Number of runs missing from the average, because the run or its antithetic partner failed."""
     diverged: Exception | None = None
-    """Error of a point that failed in `cortado.evaluate`. The loss and the gradient are then NaN."""
+    """Error of a point that failed in `cortado.evaluate`. The loss and the gradient of a failed point are NaN."""
 
     def interval(self, confidence: float = 0.95) -> tuple[Arrays, Arrays]:
         """Return the lower and the upper ends of confidence intervals for the gradient, by parameter name.
@@ -103,7 +103,7 @@ class Batchable(Protocol):
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
         """Return estimates at points with equal parameter names and shapes. The results are bitwise equal to separate
-        runs. The result for a point with a lost particle is its error."""
+        runs. A point with a lost particle has its error as the result."""
 
 
 class GradientEstimator(Protocol):

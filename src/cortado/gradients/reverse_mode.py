@@ -153,8 +153,8 @@ class Exact(AdjointEstimator):
 class Tape(AdjointEstimator):
     """A gradient estimator: the exact adjoint by Warp's automatic differentiation of the forward kernels.
 
-    The estimator serves as a check of `Exact`. It is slower than `Exact`, uses atomics on a GPU, and works only with
-    the solver ``"pcisph"``.
+    The estimator serves as a check of `Exact`. `Tape` is slower than `Exact`, uses atomics on a GPU, and works only
+    with the solver ``"pcisph"``.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.Tape())``
     """
@@ -220,20 +220,20 @@ class AdjointViscosity(AdjointEstimator):
     sum. The weights are symmetric and sum to at most 1, and the strength is at most 0.6. The sum of a_i is therefore
     conserved, and the norm of a does not grow.
 
-    Then the length of each vector a_i is limited to ``limit`` times the root mean square over all particles. In a flow
-    without strain the adjoints are not limited. `docs/gradients.md` explains both.
+    After the blending, the length of each vector a_i is limited to ``limit`` times the root mean square over all
+    particles. In a flow without strain the adjoints are not limited. `docs/gradients.md` explains both.
 
-    Long waves are slightly damped too, which affects gradients with respect to early steps most. ``order=2``
-    extrapolates the gradients g(C) and g(2 C) of two coefficients C and 2 C to zero viscosity (Richardson): the result
-    is 2 g(C) - g(2 C).
+    Long waves of the adjoint are slightly damped too, which affects gradients with respect to early steps most.
+    ``order=2`` extrapolates the gradients g(C) and g(2 C) of two coefficients C and 2 C to zero viscosity (Richardson):
+    the result is 2 g(C) - g(2 C).
 
     Bias: short waves of the adjoint are lost and long waves are weakened, so gradients of long runs are too small. If a
     loss depends on single particles, its gradient is poor, because the adjoint has no long waves. Noise: order 2 has
-    more noise, so use it with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with three
-    more neighbour sums per step.
+    more noise, so use order 2 with means over several runs (`EnsembleMean`). Cost: ``order`` backward passes, with
+    three more neighbour sums per step.
 
-    Sources: Smagorinsky (1963) for a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) for an eddy
-    viscosity of the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
+    Sources: Smagorinsky (1963) uses a viscosity by the strain rate. Wang and Zaki (2026, arXiv 2606.25399) use an eddy
+    viscosity for the adjoint of turbulence. Ke, You and Wang (2026, arXiv 2602.14016) precondition the adjoint by its
     spectrum instead.
 
     Example: ``value, gradient = problem.value_and_gradient(parameters, cortado.gradients.AdjointViscosity())``

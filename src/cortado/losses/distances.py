@@ -162,7 +162,6 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
 
 
 def _shares(weights: np.ndarray | None, end: Snapshot, name: str, vector: np.ndarray) -> np.ndarray:
-    """Return the masses divided by their sum (n,)."""
     n = len(end.positions)
     if vector.shape != (end.dimension,):
         raise InputError(f"{name} has shape {vector.shape}, but must be {(end.dimension,)}.")

@@ -55,7 +55,7 @@ class OnHost:
 
 @dataclass(frozen=True)
 class Snapshot(OnHost):
-    """A state of a rollout, usually the last one, as NumPy and Warp arrays, in the order of the initial particles."""
+    """A state of a rollout, usually the last state, as NumPy and Warp arrays, in the order of the initial particles."""
 
     state: State
     """Warp arrays (n,): positions [m], velocities [m / s], mass fractions [-], and further fields of the solver."""
@@ -63,7 +63,7 @@ class Snapshot(OnHost):
     colours: np.ndarray
     """Colours of the phases (phases, 3) in linear RGB from 0 to 1."""
     moment: Moment | None = None
-    """State and parameters of the next step, or None. Particle quantities are computed from these."""
+    """State and parameters of the next step, from which particle quantities are computed, or None."""
 
     def __repr__(self) -> str:
         return f"Snapshot({counted(len(self.state.positions), 'particle')}, {self.precision.name})"

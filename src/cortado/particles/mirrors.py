@@ -25,7 +25,7 @@ FACES, MOST_FACES = 64, 64
 NUMBERS = 2**31
 CONTAINER = -1
 NOTHING = ALL_WALLS = -NUMBERS
-"""Values that stand for no solid and for all walls, in place of the number of a solid."""
+"""Values of ``solid`` that stand for no solid and for all walls, instead of the number of a solid."""
 
 
 def reflections(moving: bool) -> int:

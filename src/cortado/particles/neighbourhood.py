@@ -118,7 +118,6 @@ def neighbourhood_type(precision: Precision) -> Any:
         first: wp.int32
         part: wp.int32
         particles: wp.int32
-        """Number of particles of one scene in a batch."""
         neighbours: wp.array2d(dtype=wp.int32)
         """Lists [neighbour, particle] of fluid neighbours, then wall neighbours, then images. Lists of fluid neighbours
         are padded with the particle itself."""
@@ -133,20 +132,16 @@ def neighbourhood_type(precision: Precision) -> Any:
         wall_weights: wp.array(dtype=real)
         wall_grips: wp.array(dtype=real)
         wall_velocities: wp.array(dtype=vector)
-        """Velocity of the surface at a wall particle [m/s]."""
         wall_feet: wp.array(dtype=vector)
         wall_solids: wp.array(dtype=wp.int32)
         wall_positions_dot: wp.array(dtype=vector)
-        """Tangents of the positions of wall particles."""
         wall_velocities_dot: wp.array(dtype=vector)
         wall_turns_dot: wp.array(dtype=vector)
         """Tangents of the rotations of the solids to which wall particles belong, as rotation vectors."""
         wall_growths_dot: wp.array(dtype=real)
         """Tangents of the weights of wall particles, divided by the weights [-]."""
         support: real
-        """Support radius h [m]."""
         per_support: real
-        """Inverse support radius [1 / m]."""
         reach: real
         """Search radius [m], slightly larger than the support radius."""
         normalisation: real
@@ -158,7 +153,6 @@ def neighbourhood_type(precision: Precision) -> Any:
         laplacian_correction: real
         """Correction factor of second derivatives [-]. See `cortado.discretise.smoothing`."""
         volume: real
-        """Particle volume on the rest lattice [m^d]."""
         period: vector
         """Lengths of the periodic box [m], 0 along axes that are not periodic."""
         frequency: vector

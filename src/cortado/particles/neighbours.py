@@ -389,7 +389,8 @@ class NeighbourSearch:
 
     @property
     def needed(self) -> int:
-        """Return the length of the longest list since the last `forget_needed`, also above the capacity."""
+        """Return the length of the longest list since the last `forget_needed`, even if the length exceeds the
+        capacity."""
         return int(self.needed_copy.read().max())
 
     def forget_needed(self) -> None:

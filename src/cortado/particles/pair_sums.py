@@ -1,5 +1,5 @@
 """Sums over neighbours. A sum is made from a function that computes the term of one pair of particles. The parameter
-names of this function are the inputs of the term.
+names of the function are the inputs of the term.
 
     @pair_sum(discretisation)
     def force(x_ij: vector, c_i: real, c_j: real, s: neighbourhood) -> vector:
@@ -276,8 +276,8 @@ def pair_sum(
 ) -> Decorator:
     """Return a decorator that turns the term of a pair into the Warp function of its sum over fluid and walls.
 
-    ``walls`` is a separate term for walls. Its parameters must also be parameters of the fluid's term. With ``rubs``,
-    walls with free slip are excluded. ``grows`` is used only for tangents with moving walls.
+    ``walls`` is a separate term for walls. The parameters of ``walls`` must also be parameters of the fluid's term.
+    With ``rubs``, walls with free slip are excluded. ``grows`` is used only for tangents with moving walls.
     """
 
     def loops(term: Term, wall: Term) -> str:
@@ -346,7 +346,6 @@ def _added(called: str, term: Term, weight: str, arguments: str) -> list[str]:
 @dataclass(frozen=True)
 class ByHand:
     kind: str
-    """"tangent" or "adjoint"."""
     of: Any
     function: Any
 

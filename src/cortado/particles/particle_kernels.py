@@ -18,7 +18,7 @@ f(x_i, ..., time_step, ...) of a particle's values:
     tangent:  r_dot[i] = df/dx x_dot[i] + ... + df/dtime_step time_step_dot[scene]
     adjoint:  x_bar[i] += (df/dx)^T r_bar[i],   time_step_bar[i] += df/dtime_step . r_bar[i]
 
-For the adjoint of a scene's parameter, each particle stores a contribution. These contributions are summed later. The
+For the adjoint of a scene's parameter, each particle stores a contribution, and the contributions are summed later. The
 tangent of a rotation R is the vector w with R_dot u = w x (R u), and the adjoint of R is the adjoint of w.
 
 Warp has two traps. After ``a, b = array[j], c`` writing to a component of ``a`` writes to the array, whereas ``a =
@@ -61,7 +61,6 @@ _total_{n} = _kind_{n}()
         {unit}[{entry}] = _one
         {gradient}
         _total_{n} += ({change}) * {unit}"""
-"""Source text of the tangent of a vector or matrix."""
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
@@ -132,9 +131,9 @@ def sum_kernel(
 def sum_kernels(
     name: str, modules: Modules, sums: Sequence[Any], result: str, before: str = "", written: Names = (), **named: Any
 ) -> Kernels:
-    """The first kernel computes ``result`` = ``before`` + ``times`` sum / ``per``, with the array ``before``. Adjoints
-    are added to the adjoints of the inputs, except for ``written`` arrays, which are overwritten. ``named`` are the
-    other arguments of `sum_kernel`."""
+    """The first of the kernels computes ``result`` = ``before`` + ``times`` sum / ``per``, with the array ``before``.
+    Adjoints are added to the adjoints of the inputs, except for ``written`` arrays, which are overwritten. ``named``
+    are the other arguments of `sum_kernel`."""
     total, tangent, adjoint = sums
     told = named | dotted({each: other for each, other in named.items() if each not in ("times", "per", "numbers")})
     numbers = named.get("numbers", ())

@@ -42,10 +42,8 @@ class StateField:
     first: str | None = None
     """Name of the parameter that contains the first value. None for a field that is 0 at the start."""
     is_constant: bool = False
-    """True if no time step changes the field."""
 
     def shape(self, particles: int, dimension: int, phases: int) -> tuple[int, ...]:
-        """Return the shape of the field as a NumPy array."""
         own = {Entry.VECTOR: (dimension,), Entry.FRACTIONS: (phases,)}.get(self.entry, ())
         return (particles if self.axis is Axis.PARTICLE else 1, *own)
 
@@ -196,7 +194,8 @@ class State(Arrays):
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make a later state of this run with uninitialised arrays. Both states share the arrays of constant fields."""
+        """Make a later state of this run with uninitialised arrays. The earlier and the later state share the arrays of
+        constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
@@ -289,14 +288,14 @@ class Parameters(Arrays):
 
     @property
     def written(self) -> Mapping[str, np.ndarray | wp.array]:
-        """Return the values that `set` has written, by name. `set_row` changes these arrays."""
+        """Return the values that `set` has written, by name. `set_row` changes the arrays of the parameters."""
         return dict(self._written)
 
     def set(self, values: Mapping[str, Any]) -> None:
         """Write parameters by name. A value is equal for all members, or has a first axis for the members. Values may
         be vectors (d,) or (steps, d), numbers, arrays of numbers, or Warp arrays.
 
-        Only `set`, `set_row` and kernels that take `to_write` may write to these arrays.
+        Only `set`, `set_row` and kernels that take `to_write` may write to the arrays of the parameters.
         """
         for name, value in values.items():
             array, last = self[name], self._written.get(name)

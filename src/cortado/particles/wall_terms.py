@@ -115,7 +115,6 @@ class WallTerm:
     make: WorkMaker
     bar: str
     rubs: bool = False
-    """True if walls with free slip are excluded."""
 
     @property
     def kernels(self) -> Kernels:

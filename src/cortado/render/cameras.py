@@ -18,7 +18,7 @@ Vector = tuple[float, ...]
 
 
 def vector(name: str, values: Sequence[float] | np.ndarray, length: int = 3) -> Vector:
-    """Return ``values`` as a tuple. Raises `InputError` if they are not ``length`` finite numbers."""
+    """Return ``values`` as a tuple. Raises `InputError` if ``values`` are not ``length`` finite numbers."""
     found = as_numbers(name, values)
     if found.shape != (length,) or not np.isfinite(found).all():
         raise InputError(f"{name} is {shown(values)}, but must be {length} finite numbers.")
@@ -40,7 +40,7 @@ class Camera:
     look_at: Vector
     """Point in the middle of the picture [m], (3,)."""
     up: Vector
-    """Direction (3,) that points upwards in the picture. It must not be parallel to the viewing direction."""
+    """Direction (3,) that points upwards in the picture, not parallel to the viewing direction."""
     resolution: tuple[int, int] = field(default=(256, 256), kw_only=True)
     """Numbers of columns and rows; pixels are square."""
     near: float = field(default=0.0, kw_only=True)
@@ -129,7 +129,7 @@ class Orthographic(Camera):
 class Perspective(Camera):
     """A camera with rays from one point.
 
-    The camera is at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` upwards. Its horizontal angle of
+    The camera is at ``position`` (3,) [m] and looks at ``look_at`` [m], with ``up`` upwards. The horizontal angle of
     view is ``field_of_view`` [degrees]. The picture shows depths from ``near`` to ``far`` [m] and has ``resolution``
     (columns, rows).
 

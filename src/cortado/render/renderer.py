@@ -46,8 +46,8 @@ class Renderer:
     """Renders a fixed number of particles in one view, on one device. Pictures are in linear RGB.
 
     Pictures are smooth functions of positions, fractions and colours, and piecewise smooth functions of the camera's
-    pose. In a view along an axis, samples may lie on faces between cells of the colour field. The derivative with
-    respect to the pose is then one-sided.
+    pose. In a view along an axis, samples may lie on faces between cells of the colour field, where the derivative with
+    respect to the pose is one-sided.
     """
 
     @WARP

@@ -18,7 +18,8 @@ MEMORY_BUDGET = 8 * 2**30
 
 
 class Checkpoints:
-    """States of a forward run at every ``interval``-th step. A backward pass recomputes the states between them."""
+    """States of a forward run at every ``interval``-th step. A backward pass recomputes the states between the stored
+    states."""
 
     def __init__(self, first: State, interval: int):
         self._first, self._interval = first, interval
@@ -76,7 +77,6 @@ class Progress:
     state: State | None = None
     """Last state of the earlier process, or None if no step was taken."""
     diagnostics: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Diagnostics (steps,) of the earlier steps, by name."""
 
     def begin(self, initial: State, sizes: StepSizes, keep: bool) -> tuple[State, int, bool]:
         """Return the first state of the resumed run, its step number, and True if the run ends there."""

@@ -54,8 +54,6 @@ Given = RestartState | Sequence[RestartState] | None
 
 
 class HostStates:
-    """Converts between states on the host and device states."""
-
     def __init__(self, simulation: Simulated):
         self._simulation = simulation
 
@@ -157,7 +155,6 @@ class DeviceState:
     """
 
     arrays: State
-    """All fields of the state, on the device."""
     scenes: tuple[RestartState, ...]
     """Clock and origin of each scene, as restart states without fields."""
 
@@ -185,7 +182,6 @@ class DeviceStates(HostStates):
         rollout.step_sizes.begin_at(rollout.initial)
 
     def follow(self, rollout: Rollout, state: DeviceState) -> None:
-        """Set the first state of a rollout from a `DeviceState`."""
         self._require_taken(state)
         rollout.begin_evaluation()
         rollout.goes_on, rollout.clocks = True, [scene.clock for scene in state.scenes]
@@ -307,9 +303,7 @@ class Packed:
         self.views = {name: part.reshape(own[name].shape) for name, part in zip(own, parts, strict=True)}
         launch = KernelLauncher(1, first.device, record_tape=False)
         self.read = CapturedGraph(partial(_copy_all, self.views, own), launch)
-        """Copies the state to the flat array."""
         self.write = CapturedGraph(partial(_copy_all, own, self.views), launch)
-        """Copies the flat array to the state."""
 
 
 def _copy_all(to: Mapping[str, wp.array], given: Mapping[str, wp.array]) -> None:

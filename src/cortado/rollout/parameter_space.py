@@ -23,7 +23,6 @@ from cortado.scene.scene_warnings import viscosity_sentence
 from cortado.scene.stability import divergence_advice
 
 SAME = 1e-9
-"""Relative tolerance for equal times."""
 STATE_TIME = "time"
 _VARIED = frozenset({"mobility", "viscosity"})
 DIFFUSION = ("time_step", "mobility", "interface_width", "rest_density")
@@ -59,7 +58,7 @@ class ParameterSpace:
         return found
 
     def _judge(self, values: Arrays) -> None:
-        """Check values for a run. Unchanged values, and a gravity weaker than the last checked one, are not checked
+        """Check values for a run. Unchanged values, and a gravity weaker than the last checked gravity, are not checked
         again."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()

@@ -32,7 +32,7 @@ OBSERVED = "a number of steps", "a state"
 CHUNK = {"cpu": 8, "cuda": 64}
 """Greatest number of steps in a chunk, by kind of device."""
 FILLED = {"cpu": 32_000, "cuda": 16_000_000}
-"""Number of particles times number of steps in a chunk. Above this product, longer chunks are not faster."""
+"""Number of particles times number of steps in a chunk, above which longer chunks are not faster."""
 
 
 class BackwardStep(Protocol):
@@ -54,7 +54,7 @@ class BackwardStep(Protocol):
 
 
 class AdjointStep:
-    """The exact `BackwardStep`: it repeats a step and then computes the adjoint."""
+    """The exact `BackwardStep`, which repeats a step and then computes the adjoint."""
 
     capturable = True
 
@@ -85,7 +85,6 @@ class Rollout(Staying):
         require(step_parts(steps, solver.discretisation.precision.bytes), "take fewer steps", self._device)
         self.initial, self.parameters = solver.new_state(), solver.new_parameters(steps)
         self.substeps = 0
-        """Number of diffusion substeps in each step."""
         self.time_steps = np.zeros(solver.layout.members)
         """Time steps (members,) [s] in double precision."""
         self.advice: Callable[[int], str] = lambda member: "try a smaller time step, or more pressure iterations"
@@ -126,7 +125,7 @@ class Rollout(Staying):
         return self.progress.whole({**found, **self.step_sizes.diagnostics(len(found["converged"]))})
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
-        """Test if no scene was lost and all steps converged, without diagnostics above the given ``limits`` by name."""
+        """Return True if no scene was lost, all steps converged, and no diagnostic exceeds its limit in ``limits``."""
         return not self.lost and self.progress.state is None and self.log.is_calm(limits)
 
     def is_last(self, step: int) -> bool:
@@ -232,7 +231,7 @@ class Rollout(Staying):
         return self._chunk[:length]
 
     def _wait(self) -> None:
-        """Wait for the device. The copies that a chunk fetched are then up to date."""
+        """Wait for the device. After this call, the copies that a chunk fetched are up to date."""
         if self._device.is_cuda:
             wp.synchronize_stream(self._device)
             self._mark(self._copies, is_fetched=True)
@@ -246,7 +245,7 @@ class Rollout(Staying):
         return length if self.steps == self.room or length < left else 1 << (length.bit_length() - 1)
 
     def _warm_up(self, first: int, beside: Beside | None) -> None:
-        """Take a step and undo it, because a graph capture must not load modules or allocate memory."""
+        """Take a step and undo the step, because a graph capture must not load modules or allocate memory."""
         self._begin_at(first)
         self._take(1, beside)
         is_short = self.solver.make_room()

@@ -82,7 +82,6 @@ def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | Non
 
 
 def outside(room: Room, points: Any, spacing: float) -> np.ndarray:
-    """Return indices of points (n, d) [m] outside the container."""
     return np.flatnonzero(~room.contains(points, TOLERANCE * spacing))
 
 
@@ -118,7 +117,7 @@ class FirstPositions:
 FURTHEST = 1.0
 """Greatest displacement of a solid in a time step [spacings]. Faster solids could pass over fluid."""
 SCALES = (0.6, 1.5)
-"""Smallest and greatest scale of a solid with wall particles. Beyond these scales, fluid leaks."""
+"""Smallest and greatest scale of a solid with wall particles. At other scales, fluid leaks through the solid."""
 
 
 def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, courses: dict[str, Changing]) -> str | None:

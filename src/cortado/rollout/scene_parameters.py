@@ -35,7 +35,6 @@ class Simulated(Source, Protocol):
     known: Known
     forces: tuple[ForceMaker, ...]
     judged_states: WeakSet[RestartState]
-    """Restart states that have already been checked."""
     batch: int | None
     """Number of scenes in a batch, or None for a single scene."""
     solver: Solver
@@ -88,7 +87,6 @@ class SceneParameters:
         return {name: known.views[name] for name in values if name in known.views and known[known.views[name]].grows}
 
     def _times(self, name: str, values: Arrays, clock: Clock | None = None) -> NDArray:
-        """Return the times (steps,) [s] for the values of a scheduled parameter."""
         return (clock or Clock()).times(self._moments(name), float(values.get("time_step", self.values["time_step"])))
 
     def _moments(self, name: str) -> NDArray:
@@ -143,8 +141,8 @@ class SceneParameters:
         bad = np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))
         if bad.size:
             said = f"mass_fractions of particle {bad[0]} are {fractions[bad[0]].tolist()}"
-            volume = "its volume, the sum of the fractions over the rest densities of the phases"
-            raise InputError(f"{said}, but must be such that {volume}, is greater than 0.")
+            volume = "the sum of fractions divided by rest densities"
+            raise InputError(f"{said}, but {volume} must be greater than 0.")
         return {**fields, DENSITY: found}
 
     def direction(

@@ -101,7 +101,6 @@ class Travel:
         return max(float(end - time), self.least)
 
     def at(self, times: ArrayLike) -> NDArray[np.float64]:
-        """Return the distances [m] covered at times [s]."""
         return np.asarray(np.interp(np.asarray(times), self.times, self.lengths))
 
     def steps(self, duration: float, longest: float) -> float:
@@ -175,7 +174,6 @@ def counted_steps(time: float, steps: float) -> int:
 
 
 def expected_frames(rollout: Rollout, record_every: int) -> int:
-    """Return an upper estimate of the number of frames."""
     return 2 + rollout.steps // (ROOM if ends_at_a_time(rollout) else 1) // record_every
 
 

@@ -76,7 +76,6 @@ class Compressions:
         self._each = wp.zeros(layout.all_particles, dtype=layout.precision.pair, device=device)
         self._greatest = sum_and_maximum(layout.particles, layout.precision, device, layout.members)
         self.added = wp.zeros((steps, layout.members), dtype=layout.precision.real, device=device)
-        """Increase of compression (steps, members) [-]."""
 
     def measure(self, state: State) -> None:
         solver, members = self._solver, self._solver.layout.members
@@ -118,14 +117,13 @@ def compression_kernels(precision: Precision) -> tuple[Any, Any]:
 
 
 GROWTH = 1.1
-"""Greatest ratio of successive time steps."""
 LEAST = 1e-6
 """Shortest time step for fast fluid, relative to the bound without fluid."""
 
 
 Scheduled = tuple[Callable[[NDArray], NDArray], Callable[[int, NDArray, NDArray], None]]
-"""The first function maps times (members,) [s] to the longest time steps. The second writes the scheduled parameters of
-a step, given its number, times and lengths (members,) [s]."""
+"""The first of the two functions maps times (members,) [s] to the longest time steps. The second function writes the
+scheduled parameters of a step, given its number, times and lengths (members,) [s]."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ class StepSizes:
         """Set the solver to the recorded length of a step. The first ``step`` is 0."""
 
     def read(self, first: int, last: int) -> tuple[int, bool]:
-        """Read step lengths. Return the number of the last valid state, and True if the run ends there."""
+        """Read step lengths. Return the number of the last valid state, and True if the run ends at that state."""
         return last, False
 
     def again(self, first: int, last: int) -> bool:

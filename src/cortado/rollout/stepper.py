@@ -56,7 +56,7 @@ def require_hash(estimator: Any) -> Any:
 
 
 def backward_step(rollout: Rollout, estimator: ReverseEstimator | None) -> BackwardStep:
-    """Return the backward step of an estimator, by default of the exact one. The rollout caches backward steps."""
+    """Return the backward step of an estimator, by default of `Exact`. The rollout caches backward steps."""
     solver = rollout.solver
     if estimator is not None:
         wanted = "an AdjointEstimator such as cortado.gradients.AdjointViscosity()"
@@ -207,7 +207,7 @@ class Stepper:
         self, residual: StepResidual, state_bar: Values, gradient: ReverseEstimator | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the adjoints of the first state and of the given parameters, given the adjoint ``state_bar`` of the
-        last state (reverse mode). ``gradient`` is the estimator, by default the exact one; see `docs/gradients.md`.
+        last state (reverse mode). ``gradient`` is the estimator, by default `Exact`; see `docs/gradients.md`.
 
         The adjoint of a state is a dictionary of arrays by field name, with the shapes of the fields. The key ``time``
         has a number. Missing fields are 0. Arrays of a `DeviceState` are on the device, and arrays on the host are in
@@ -384,7 +384,7 @@ class Stepping:
 
     @in_turn
     def stepper(self, steps: int) -> Stepper:
-        """Return the `Stepper` for this number of steps. The last few steppers are cached."""
+        """Return the `Stepper` for the given number of steps. The last few steppers are cached."""
         steppers: dict[int, Stepper] = self.__dict__.setdefault("_steppers", {})
         found = steppers.pop(steps, None) or Stepper(cast(Simulated, self), check_steps(steps, least=0))
         steppers[steps] = found  # the last one

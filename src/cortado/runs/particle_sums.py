@@ -192,7 +192,8 @@ class Seen:
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """Convert derivatives along weights (n,) to those along the vectors from the place to the particles (n, k)."""
+        """Convert derivatives with respect to weights (n,) to derivatives with respect to the vectors (n, k) from the
+        place to the particles."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
             found[image.near] += (each[image.near] * image.slopes / self.reach**2)[:, None] * image.ways
@@ -247,7 +248,8 @@ class LoadSensor(Summed):
 
 @dataclass(frozen=True, eq=False)
 class WeightedSum:
-    """Sums around a place: of the weights, and of the weights times a quantity or a velocity component."""
+    """Sums around a place: the sum of the weights, and the sum of the weights times a quantity or a velocity
+    component."""
 
     around: Around
     quantity: str | None = None

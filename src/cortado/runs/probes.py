@@ -162,7 +162,7 @@ class WallForce(LoadSensor):
         about the point ``about`` (d,) [m], by default the origin.
 
         ``on`` names a solid that carries and rotates the region and the point. With ``axes`` "world", force and torque
-        are along the axes of the scene. With "body", they are along axes that rotate with the solid.
+        are along the axes of the scene. With "body", force and torque are along axes that rotate with the solid.
         """
         self.lower = None if lower is None else corner("lower", lower)
         self.upper = None if upper is None else corner("upper", upper)
@@ -219,17 +219,18 @@ class SolidLoad(LoadSensor):
 
     F = sum_i f_i,   T = sum_i (x_i - c) x f_i.
 
-    The sums are over all particles i at x_i. The force f_i is minus the force of the solid's walls on particle i. Walls
-    act through pressure and, if they are no-slip walls, viscosity. Forces are those in the step after the state, and c
-    is the middle of the solid at the end of this step. The solid gains exactly the momentum that the fluid loses. Not
-    included are contact, gravity, buoyancy in air, and user-defined forces between fluid and walls.
+    The sums are over all particles i at x_i. The force f_i is minus the force of the solid's walls on particle i.
+    No-slip walls act through pressure and viscosity, and other walls act through pressure only. The forces act in the
+    step after the state, and c is the middle of the solid at the end of that step. The solid gains exactly the momentum
+    that the fluid loses. The load excludes contact, gravity, buoyancy in air, and user-defined forces between fluid and
+    walls.
 
     Example: ``run = simulation.run(100, sensors={"load": cortado.sensors.SolidLoad("pillar")})``
     """
 
     def __init__(self, solid: str, axes: Axes = "world"):
         """Measure the solid with the name ``solid``. With ``axes`` "world", force and torque are along the axes of the
-        scene. With "body", they are along axes that rotate with the solid."""
+        scene. With "body", force and torque are along axes that rotate with the solid."""
         self.solid, self.axes = named("solid", solid, "solid"), axes_of(axes, True)
 
     def summed(self, at: SensedScene) -> LoadSum:

@@ -42,7 +42,8 @@ SIX = wp.types.vector(6, wp.float64)
 
 @dataclass(frozen=True)
 class Bars:
-    """Adjoints of a time step's intermediate values. The adjoints of quantities are added to these arrays."""
+    """Adjoints of a time step's intermediate values. Formulas add the adjoints of quantities to the arrays of this
+    object."""
 
     of: Adjoints
     p: wp.array

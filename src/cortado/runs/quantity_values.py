@@ -44,7 +44,7 @@ class Moment:
     """Number of the step in its run, from 0. For the last state, the number of steps of the run."""
     evaluator: "Evaluator"
     wanted: set[str] = field(default_factory=set)
-    """Names of the quantities that were read so far. All moments of a run share this set."""
+    """Names of the quantities that were read so far. All moments of a run share one set of names."""
     counts: list[Counts] = field(default_factory=list)
     """Iteration counts of the step. The list is empty if the run has not taken the step."""
     _values: Arrays = field(default_factory=dict)
@@ -190,7 +190,6 @@ class QuantityEvaluator:
         return wanted
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
-        """Find neighbours. If a quantity needs the pressure, also compute the step."""
         self._set(moment)
         if any(map(_needs_the_step, names)):
             return self._solve(replay)
@@ -301,7 +300,8 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return weights by time step in the value of `row_of`, or None for a parameter that is constant in time."""
+    """Return the weights of the time steps in the value of `row_of`, or None for a parameter that is constant in
+    time."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None

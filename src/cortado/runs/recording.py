@@ -98,7 +98,7 @@ FrameChoice = EverySteps | FramesPerSecond
 @dataclass(frozen=True, eq=False)
 class TrajectoryBatch(Sequence[Trajectory]):
     """The trajectories of a batch of runs. ``batch[b]`` is the `Trajectory` of scene b, with exactly the numbers of a
-    run of this scene alone. If scene b lost a particle, its trajectory ends before the loss."""
+    run of this scene alone. If scene b lost a particle, the trajectory of scene b ends before the lost particle."""
 
     trajectories: tuple[Trajectory, ...]
     fields: Mapping[str, NDArray[Any]]

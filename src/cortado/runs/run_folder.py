@@ -48,8 +48,8 @@ class _Entry:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """The file environment.json marks a run folder. The file is written first and removed last, so that the folder of a
-    killed process can be overwritten or resumed."""
+    """The file environment.json marks a run folder. The file environment.json is written first and removed last, so
+    that the folder of a killed process can be overwritten or resumed."""
 
     path: Path
     scene = _Entry("scene.json")
@@ -152,7 +152,6 @@ class RunFolder:
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:
-        """Read the scene without warnings."""
         text = bytes_of(self.scene).decode(errors="replace")
         with unwarned():
             try:

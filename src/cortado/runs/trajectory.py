@@ -204,7 +204,7 @@ class Trajectory:
     @property
     def iterations(self) -> NDArray[Any]:
         """Return the pressure iterations of each step (steps,) [-]. Raises `InputError` if the solver does not record
-        them."""
+        numbers of iterations."""
         return noted(self.diagnostics, "iterations")
 
     @property
@@ -260,9 +260,8 @@ class Trajectory:
         Colours are as in pictures. Return the file to open, or the folder of a series of files.
 
         ``to`` is "usd" for one file with time samples, or "ply", "obj", "glb" or "vtp" for one file per frame. With
-        "vtp", a file ``run.pvd`` for ParaView is added. ``scene`` is the scene or the path of its file. It is needed
-        for a trajectory from a file. The ``folder`` must be empty or missing. In 2-D no surface is exported, and z is
-        0.
+        "vtp", a file ``run.pvd`` for ParaView is added. ``scene`` is the scene or the path of its file. A trajectory
+        from a file needs ``scene``. The ``folder`` must be empty or missing. In 2-D no surface is exported, and z is 0.
 
         Raises `InputError` for an unknown format, a folder with files, a missing or wrong scene, a missing library, or
         a ``picture.colour`` of the scene that was not recorded. Raises `ComputationError` if the disk is full.
@@ -296,8 +295,8 @@ class Trajectory:
     def film(
         self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> Film:
-        """Write a film of the run and return it. A notebook plays the film. After a stop by Ctrl-C, a second call with
-        the same arguments continues the film. See `docs/pictures.md`.
+        """Write a film of the run, and return the film. A notebook plays the film. After a stop by Ctrl-C, a second
+        call with the same arguments continues the film. See `docs/pictures.md`.
 
         Args:
             path: path that ends in .mp4, or in .webp for an animation on web pages. A .webp cannot be continued after a
@@ -320,9 +319,9 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read the file at ``path``, written by `save` or `TrajectoryWriter`. The process that writes the file may
-        still be running, or may have been killed. Raises `InputError` if the file is missing, damaged, or not a
-        trajectory of Cortado."""
+        """Read the file at ``path``, written by `save` or `TrajectoryWriter`. The process that writes the trajectory
+        file may still be running, or may have been killed. Raises `InputError` if the file is missing, damaged, or not
+        a trajectory of Cortado."""
         arrays = vtkhdf.read(as_path("path", path))
         names = ("times", "steps", "positions", "velocities", "diagnostics", "others", "constants")
         phases = sum(name.startswith(FRACTION) for name in arrays)

@@ -47,7 +47,7 @@ from cortado.scene.solids import SolidTable
 
 MOST = 4_000_000
 FILM = 1.0
-"""Depth of the film of fluid above a solid with fluid below it [spacings]."""
+"""Depth of the film of fluid above a solid with fluid below the solid [spacings]."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,6 @@ class Standing:
     own: Solid
     middle: NDArray[Any]
     turn: NDArray[Any]
-    """Rotation matrix (d, d)."""
     scale: float
     pose: Pose | None
 
@@ -87,7 +86,6 @@ class Axis:
     up: tuple[float, ...]
     reach: float
     step: float
-    """Distance between points [m]."""
     film: float
     beside: tuple[tuple[float, ...], ...]
     """Unit vectors perpendicular to the axis (d - 1, d)."""
@@ -263,8 +261,8 @@ class WaveGauge(Summed):
 
     Here r_i is the horizontal distance of particle i, V = spacing^d its volume, and w a smooth function. Solids occupy
     part of the column. The height is also correct above a solid on the floor, within the fluid or piercing its surface.
-    Fluid in the air counts as if it lay on the fluid below. Fluid on a solid with air below counts in the same way. The
-    column ends at sides of the container that are parallel to ``up``.
+    Fluid in the air, or on a solid with air below the solid, counts as if the fluid lay on the fluid below. The column
+    ends at sides of the container that are parallel to ``up``.
 
     Example::
 

@@ -108,7 +108,7 @@ def check_own(known: Known, source: Source) -> None:
 
 
 def fingerprint(makers: Sequence[Any], source: Source) -> str:
-    """Return a hash of makers and their parameter values, or an empty text without makers."""
+    """Return a hash of makers and their parameter values, or an empty text if no makers are given."""
     words = []
     for maker in makers:
         parameters = getattr(maker, "parameters", ())
@@ -128,7 +128,6 @@ class SolverSetting:
     device: Any
     batch: int | None
     forces: Sequence[ForceMaker]
-    """Makers of user-defined forces."""
     known: Known
     called: str
     lanes: int | None = None

@@ -211,7 +211,6 @@ class Touching:
     """Solids that a free body may touch: either all solids at rest, or one moving solid."""
 
     body: int
-    """Index of the body among the free bodies."""
     against: int
     """Index of the touched solid among the moving solids; -1 for solids at rest."""
     other: int
@@ -331,7 +330,6 @@ class Contacts:
         self._shares = [Totals(contact, share_kinds(layout)) for contact in self.contacts]
         self._sums: list[Arrays] = [{} for _ in self.contacts]
         self._unsaid: Arrays = {}
-        """Default coefficients of friction and restitution."""
         for label, value in (("friction", 0.0), ("restitution", RESTITUTION)):
             for name, number in ((label, value), (f"{label}_dot", 0.0), (f"{label}_bar", 0.0)):
                 self._unsaid[name] = wp.full(layout.members, number, layout.precision.real, layout.device)

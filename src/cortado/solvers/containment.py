@@ -173,7 +173,7 @@ Distance = Callable[[Points], Points]
 
 @dataclass(frozen=True)
 class Lost:
-    """The particles of a scene that were lost in the first step with a loss."""
+    """The particles that a scene lost in the first step with lost particles."""
 
     step: int
     particle: int
@@ -284,7 +284,7 @@ def _moved_distance(one: Obstacle, middle: np.ndarray, turn: np.ndarray, scale: 
 NARROW = 0.95
 """Smallest gap between two walls that does not squeeze particles [spacings]."""
 FACING = -0.5
-"""Two walls face each other if the scalar product of their normals is less than this number."""
+"""Scalar product of the normals of two walls, below which the walls face each other."""
 STEP = 1e-3
 """Step of finite differences for normals [spacings]."""
 

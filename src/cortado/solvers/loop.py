@@ -216,7 +216,6 @@ class Loop:
         precision, device = layout.precision, layout.device
         self.limits, self.iterations_name, self.layout = limits, iterations_name, layout
         self.columns = [errors_name] if weighted else [errors_name, f"greatest_{errors_name}"]
-        """Names of the reduced errors in diagnostics."""
         self.errors = wp.zeros(layout.all_particles, dtype=precision.pair, device=device)
         """Array of shape (n,) with two error values of each particle in the last iteration."""
         self.rounds = wp.full(layout.members, UNKNOWN, dtype=wp.int32, device=device)
@@ -228,7 +227,6 @@ class Loop:
         self._sums = wp.zeros(layout.members, dtype=precision.pair, device=device)
         is_fixed = limits is not None and limits.minimum_iterations == limits.maximum_iterations
         self._fixed = limits.minimum_iterations if limits is not None and is_fixed else 0
-        """Number of iterations if the number is fixed, otherwise 0."""
         self.bounds: dict[str, float] = {}
         """Bounds on the reduced errors, by name. With a fixed number of iterations the dict is empty."""
         if limits is not None and not is_fixed:

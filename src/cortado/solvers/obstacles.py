@@ -40,7 +40,7 @@ class Obstacle:
     solid: Solid
     is_hollow: bool
     thickness: float
-    """Thickness of the thinnest part of the solid [m]; infinite if it is unknown."""
+    """Thickness of the thinnest part of the solid [m], or infinity for an unknown thickness."""
 
 
 @dataclass(frozen=True)

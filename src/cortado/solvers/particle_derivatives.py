@@ -24,7 +24,6 @@ class ParticleTangent:
         self.carried_dot = Carried(solver.carried_fields, solver.layout)
         kick = solver.kick_of(self.carried_dot)
         self.dot = Tangents(fields, solver.new_fractions(), parameters_dot, bodies, kick)
-        """Tangents of the parameters and of sorted particles."""
         self.density = solver.density.new_tangent()
         self._accelerations_dot = [solver.vectors() for _ in range(len(solver.forces) + 1)]
         finalize(self, solver.launch.forget)
@@ -126,12 +125,10 @@ class ParticleAdjoint:
             acceleration_bar = acceleration_bar if passed is None else passed
 
     def mix(self, context: StepContext, state_bar: State) -> None:
-        """Apply the adjoint of sorting the fields of parts."""
         for part in self._parts:
             part.sort(context, self.bar, state_bar)
 
     def sort(self, context: StepContext, state_bar: State, **carried_bar: wp.array) -> None:
-        """Apply the adjoint of sorting the particles."""
         solver, b = self._solver, self.bar.fields
         self.density.measure(context, self.bar)
         with context.aside():

@@ -47,7 +47,6 @@ class ParticleSystem:
     faces: FlatFaces
     solids: Mapping[str, NamedSolid]
     sheets: Sheets | None
-    """Sheets, which are walls without thickness, or None."""
     of_one_lane: Callable[[], "ParticleSystem"]
     """Function that makes a system with kernels for ``warp.Tape``."""
 
@@ -60,11 +59,9 @@ class ParticleSolver(Staying):
     """
 
     carried_fields: tuple[StateField, ...] = ()
-    """Fields of particles that the solver needs in the next step."""
     topic = "density"
-    """Word in the names of the solver's Warp modules."""
     density_power = 2
-    """The pressure force divides the pressure by this power of the number density."""
+    """Power of the number density by which the pressure force divides the pressure."""
     shares: tuple[str, ...] = ()
     """Parameters of the solver with adjoints that are sums over particles."""
 
@@ -115,7 +112,8 @@ class ParticleSolver(Staying):
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return the velocity changes in ``carried`` by the last step's pressure, or None if none are stored."""
+        """Return the velocity changes by the previous step's pressure from ``carried``, or None without stored
+        changes."""
         return None
 
     def vectors(self) -> wp.array:

@@ -18,7 +18,8 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
 
 Counts = tuple[int, ...]
-"""Numbers of iterations of each loop in a step. With these numbers, the step can be repeated exactly."""
+"""Numbers of iterations of each loop in a step. With the numbers of iterations, a solver can repeat the step
+exactly."""
 
 
 class StepLog(Protocol):
@@ -39,11 +40,12 @@ class StepLog(Protocol):
         """Return the host copies of the log's arrays."""
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
-        """Test if all loops converged in all steps up to the last `read`, without diagnostics above ``limits``."""
+        """Return True if all loops converged in all steps up to the last `read`, and no diagnostic exceeds
+        ``limits``."""
 
     def read(self, steps: int) -> None:
-        """Set ``steps`` as the number of steps in the last run. The diagnostics of these steps are read from the device
-        when needed."""
+        """Set ``steps`` as the number of steps in the last run. The diagnostics of the last run are read from the
+        device when needed."""
 
     def assign(self, other: Self) -> None:
         """Copy the diagnostics from a log of the same solver and length."""
@@ -115,7 +117,7 @@ class Solver(Protocol):
     """Number of times that arrays or launches were replaced. A replacement makes captured CUDA graphs invalid."""
 
     def new_state(self, requires_grad: bool = False) -> State:
-        """Make a state of this solver's particles with the value 0 everywhere."""
+        """Make a state of the solver's particles with the value 0 everywhere."""
 
     def new_parameters(self, steps: int, requires_grad: bool = False) -> Parameters:
         """Make the parameters of a run of ``steps`` steps with the value 0 everywhere."""
@@ -134,7 +136,7 @@ class Solver(Protocol):
         """Return host copies of the arrays that `make_room` and the search for lost particles read."""
 
     def make_room(self) -> bool:
-        """Lengthen neighbour lists that were too short. Return True if steps must be repeated for this reason."""
+        """Lengthen neighbour lists that were too short. Return True if steps must be repeated with the longer lists."""
 
     def step(self, state: State, new_state: State, parameters: Parameters, log: Any) -> None:
         """Take one step, and record the step in ``log``. ``state`` and ``new_state`` may be the same object."""
@@ -158,7 +160,7 @@ class Solver(Protocol):
         """Return the adjoint of a step (reverse mode), for a run of ``steps`` steps."""
 
     def differentiable(self) -> Self:
-        """Return a copy of this solver with arrays that ``warp.Tape`` can differentiate."""
+        """Return a copy of the solver with arrays that ``warp.Tape`` can differentiate."""
 
     def match(self, other: Self) -> None:
         """Copy the capacities and the number of substeps from a solver of the same kind."""

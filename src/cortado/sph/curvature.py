@@ -34,7 +34,7 @@ from cortado.particles.particle_kernels import over, particle_kernel, sum_kernel
 from cortado.sph.moment_functions import cross_terms_function, moment_functions
 
 DEEP, EXCESS, ACTS = 1.05, 0.6, 0.75
-"""Lengths that determine the depth of the force [spacings]; see the docstring of this module."""
+"""Lengths that determine the depth of the force [spacings]; see the docstring of `cortado.sph.curvature`."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,6 @@ class CurvatureConstants:
     width: float
     """Sum of weighted normals over the layers of a flat surface [-]."""
     depth: float
-    """Mean depth of the force below the surface [m]."""
 
     @classmethod
     def of(cls, kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> "CurvatureConstants":
@@ -70,11 +69,11 @@ def _width(kernel: SmoothingKernel, support: float, dimension: int, cut: tuple[i
 
 FAINT, CLEAR = 0.03, 0.1
 SINGULAR = {2: 1e-3, 3: 1e-4}
-"""Number added to a determinant, for each dimension. The curvature is then 0 if neighbours lie on a line."""
+"""Number added to a determinant, for each dimension, so that the curvature is 0 if neighbours lie on a line."""
 LONE = 1e-6
-"""Number added to the sum of weights. The mean curvature is then 0 without neighbours in the surface."""
+"""Number added to the sum of weights, so that the mean curvature is 0 without neighbours in the surface."""
 HOLLOW = 0.25
-"""Curvature of a bubble times the depth of the force. Above this value the curvature is smoothly limited."""
+"""Curvature of a bubble times the depth of the force, above which the curvature is smoothly limited."""
 
 
 @cache

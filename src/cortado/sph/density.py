@@ -164,7 +164,8 @@ class WallAction(Protocol):
 
 
 class WallSums:
-    """A `WallAction` that sums a `WallTerm`. Each call of a method overwrites the array of the previous call."""
+    """A `WallAction` that sums a `WallTerm`. Each call of a method overwrites the array that the previous call
+    returned."""
 
     def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
         self.term, self._layout, self._constants = term, layout, constants

@@ -218,7 +218,7 @@ INPUTS = {
 
 @dataclass(frozen=True)
 class Formula:
-    """A user-defined function for kernels. Formulas are equal if they compute the same."""
+    """A user-defined function for kernels. Two formulas are equal if they compute the same values."""
 
     name: str
     text: str

@@ -46,7 +46,7 @@ class FreeEnergy:
     eigenvalue bounds the time step."""
     functions: Callable[[Precision, int], Any]
     """Function from a precision and a number of phases to an object with two Warp functions. ``gradient`` is the
-    gradient of the free energy, and ``hessian_product`` the product of its Hessian and a vector."""
+    gradient of the free energy, and ``hessian_product`` is the product of the Hessian and a vector."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):

@@ -68,8 +68,6 @@ class BodyFriction:
 
 
 class BodyRows:
-    """The additional unknowns of a solve for one rigid body."""
-
     def __init__(self, layout: Layout):
         six, vector = layout.precision.six, layout.precision.vector
         kinds = {**dict.fromkeys(("r", "rise", "p", "y", "product", "first"), six), "V": vector, "W": vector}

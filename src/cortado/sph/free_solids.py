@@ -154,7 +154,8 @@ class Push(Protocol):
 
     @property
     def derivatives(self) -> tuple[type, type]:
-        """Classes of tangent and adjoint. Their methods ``look`` add to `Changes.given`, or read the adjoints there."""
+        """Classes of tangent and adjoint. The classes have methods ``look``, which add to `Changes.given`, or read the
+        adjoints of `Changes.given`."""
 
     def look(self, step: StepContext) -> None:
         """Add the momenta by this force to `FreeBody.given` of the rigid bodies."""
@@ -173,7 +174,8 @@ class Motions:
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
-        """``given`` are momenta by contacts, springs and friction, ``pressed`` by pressures of the previous step."""
+        """``given`` has the momenta by contacts, springs and friction. ``pressed`` has the momenta by pressures of the
+        previous step."""
 
 
 class FreeBody(Motions):

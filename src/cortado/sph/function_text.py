@@ -113,7 +113,7 @@ def _instructions(code: CodeType) -> list[tuple[str, Any]]:
 
 
 class Frozen:
-    """Copies of all outside values that a function and the functions it calls read."""
+    """Copies of all outside values that a function, or a function called by it, reads."""
 
     def __init__(self, what: str, function: FunctionType):
         self._what, self._made = what, dict[Any, Any]()

@@ -40,7 +40,7 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 class OverTime:
     """A parameter of a force that changes in time: linear between the given times, and constant before and after them.
 
-    A step uses the value at its middle. A search may use one value for each step.
+    A time step uses the value at the middle of the step. A search may use one value for each step.
 
     Example: ``k = cortado.forces.OverTime([0.0, 0.5], [2.0, 8.0])``
     """
@@ -292,7 +292,7 @@ class Pair(OwnForce):
 
     ``x_ij`` [m] and ``v_ij`` [m/s] are the particle's position and velocity relative to the neighbour. The time ``t``
     may be left out. The force is multiplied by a weight that falls from 1 at distance 0 to 0 at the support radius.
-    Momentum is conserved if f(-x, -v) = -f(x, v) for the function f. Walls exert no force of this kind.
+    Momentum is conserved if f(-x, -v) = -f(x, v) for the function f. Walls exert no user-defined pair force.
 
     Example::
 

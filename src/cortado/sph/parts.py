@@ -41,7 +41,7 @@ from cortado.scene.scene import Scene
 class StepContext:
     """The current step, with all arrays that its parts may read.
 
-    Kernels find arguments in the context by name: the fields of the particles and the parameters. They also find the
+    Kernels find arguments in the context by name: the fields of the particles and the parameters. Kernels also find the
     neighbourhood ``s``, ``order`` (from sorted to scene order), the number ``step`` (members,) of the step, and the
     volume ``cell`` of a particle [m^d]. In a batch particle i belongs to scene i // ``particles``.
     """
@@ -68,8 +68,8 @@ class StepContext:
         """Launch a kernel over the particles. The context provides all arguments that are missing in ``arguments`` and
         ``groups``.
 
-        A kernel with the argument ``s`` has it as the first argument, and works on particle ``s.first + wp.tid()``,
-        because its launch may be split into ranges of particles. ``threads`` is for kernels without ``s``.
+        If a kernel has the argument ``s``, ``s`` is its first argument. The kernel works on particle ``s.first +
+        wp.tid()``, because a launch may be split into ranges of particles. ``threads`` is for kernels without ``s``.
         """
         self.launcher(kernel, *groups, *self._known, threads=threads, **arguments)
 
@@ -154,7 +154,7 @@ class Setting:
 class Force(Protocol):
     """Protocol of an explicit force. A step adds up the accelerations [m / s2] of all forces.
 
-    ``batches = True`` declares that the force supports batches. Its kernels then read, for particle i, the parameters
+    ``batches = True`` declares that the force supports batches. The kernels then read, for particle i, the parameters
     of scene i // particles.
     """
 
@@ -163,10 +163,11 @@ class Force(Protocol):
     Adjoints of parameters over time are sums (members, steps) instead."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        """Write the sum of ``before`` and this force's acceleration to ``after``. Both arrays contain (n,) vectors."""
+        """Write the sum of ``before`` and the force's acceleration to ``after``. ``before`` and ``after`` contain (n,)
+        vectors."""
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
-        """Write the sum of ``before`` and the tangent of this force's acceleration to ``after``, (n,) vectors."""
+        """Write the sum of ``before`` and the tangent of the force's acceleration to ``after``, (n,) vectors."""
 
     def adjoint(self, step: StepContext, acceleration_bar: wp.array, bar: Adjoints) -> wp.array | None:
         """Add to the adjoints ``bar`` of the force's inputs, given the adjoint of the acceleration, (n,) vectors.
@@ -219,7 +220,6 @@ class Part:
     shares: tuple[str, ...] = ()
     """Names of parameters with adjoints that are sums over particles; see `Force.shares`."""
     derivatives: tuple[type[PartTangent], type[PartAdjoint]] | None = None
-    """Classes of the part's tangent and adjoint, or None."""
 
     def set_substeps(self, substeps: int) -> None:
         """Set the number of diffusion substeps for later steps."""
@@ -229,10 +229,10 @@ class Part:
         because the step may overwrite them."""
 
     def sort(self, step: StepContext, state: State) -> None:
-        """This method is called when the particles are sorted."""
+        """A step calls this method when the particles are sorted."""
 
     def settle(self, step: StepContext) -> None:
-        """This method is called when neighbours and densities are known."""
+        """A step calls this method when neighbours and densities are known."""
 
     def target(self, moved: State) -> State:
         """Return the state from which `end` reads positions and velocities. A part that changes positions or velocities

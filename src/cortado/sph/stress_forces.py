@@ -225,7 +225,6 @@ LAWS: dict[str, Callable[..., Any]] = {law.__name__: law for law in (power_law, 
 
 
 SHEAR_RATES = np.logspace(-6.0, 6.0, 601)
-"""Shear rates for tests of laws [1/s]."""
 
 
 @cache

@@ -109,7 +109,6 @@ class ViscousStress:
         return None
 
     def _back(self, step: StepContext, bar: Adjoints, acceleration_bar: wp.array, now: Named, v_bar: wp.array) -> None:
-        """The arrays ``now`` are those that `resisted` returns."""
         bars = {**{f"{name}_bar": array for name, array in self._change.items()}, "v_bar": v_bar}
         known = bars, now, *bar.named, self.constants, self._of, {"acceleration_bar": acceleration_bar}
         of_stress, of_particles = self._kernels.force.adjoint
@@ -120,7 +119,6 @@ class ViscousStress:
         self._give(step, bar, 1, *known)
 
     def back_to_sums(self, step: StepContext, bar: Adjoints, bars: dict[str, wp.array], now: Named) -> None:
-        """The arrays ``now`` are those that `resisted` returns."""
         known = self._own.back(step), bars, now, *bar.named, self.constants, self._of
         step.launch(self._kernels.stress.adjoint, *known)
         at_the_start, A_bar = now["v"] is step.fields["v"], bars["A_u_bar"]
@@ -255,7 +253,6 @@ class ImplicitViscousStress(ViscousStress):
         self._after = after
 
     def _find_end(self, step: StepContext, acceleration: wp.array) -> None:
-        """Write velocities, velocity sums and stresses at the end of the step."""
         step.launch(self._implicit.predict, acceleration=acceleration, u=self._u)
         self.free.hang(step, self._u)
         step.launch(self._pull, *self._known(), v=self._u)

@@ -71,7 +71,6 @@ def density_ratio_kernels(discretisation: Discretisation) -> SimpleNamespace:
         return (own - t_bar_i + other - t_bar_j) * gradient(x_ij, s), weight(x_ij, s) * (own - other) / m_i
 
     def relaxation(wall_y_i: real, t_i: real) -> real:
-        """Return the product of the two relaxation factors."""
         excess = real(0.0)
         if t_i > real(0.0):
             excess = real(0.5) * t_i * t_i / (t_i + a)
@@ -133,7 +132,6 @@ class Pcisph(ParticleSolver):
     topic = "pcisph"
 
     def __init__(self, system: ParticleSystem, limits: LoopLimits | None, requires_grad: bool = False):
-        """With ``limits`` None there is no pressure."""
         super().__init__(system, requires_grad)
         self.limits, own = limits, self.discretisation
         self.kernels = SimpleNamespace(
@@ -148,7 +146,7 @@ class Pcisph(ParticleSolver):
         self.known: dict[str, Any] = {"wall_y": wall_y, "t": t, "y": y, "stiffness": self.lattice.stiffness}
         self.iterates = SimpleNamespace(x_star=[], v_star=[], p=[self.numbers()], c=[])
         """Predicted states and pressures of the iterations of a step. Without derivatives, only the latest iteration is
-        stored. ``p`` has the pressures before each iteration; the first is always 0."""
+        stored. ``p`` has the pressures before each iteration, which are 0 before the first iteration."""
         Pcisph.reserve(self, (1,))
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)
@@ -192,7 +190,6 @@ class Pcisph(ParticleSolver):
         return PcisphAdjoint(self, steps)
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Compute a step up to the pressure iterations."""
         it, context = self.iterates, self.sort(state, parameters)
         with context.aside():
             context.launch(self.kernels.wall_relaxation.forward, y=self.known["wall_y"])

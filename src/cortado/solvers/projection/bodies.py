@@ -144,14 +144,12 @@ class Held:
     def __init__(self, body: FreeBody, layout: Layout, begun: FreeBody | Changes, suffix: str = ""):
         self.body, self.given, self._layout = body, begun.given, layout
         self.start = {f"{name[0]}_0{name[1:]}": array for name, array in begun.before.items()}
-        """Velocity, angular velocity and angular momentum of the body without pressures."""
         precision, vector, size = layout.precision, layout.precision.vector, (layout.members, layout.precision.vector)
         self.known = layout.arrays(suffix, gamma_of=vector, arm=vector, sizes=precision.pair)
         self.shares = layout.arrays(suffix, pulled=vector, twisted=vector)
         self.moved = zeros({f"{name}{suffix}": size for name in "VWL"}, layout.device)
         """Velocity, angular velocity and angular momentum of the body with the pressures of an iteration."""
         self.faster = zeros({f"{name}{suffix}": size for name in ("faster", "turned_faster")}, layout.device)
-        """Changes of velocity and angular velocity by pressures."""
         self._sums = [layout.sum_of(vector) for _ in range(2)]
         self._suffix, self._whole = suffix, layout.sum_of(precision.pair)
         self.whole: Arrays = {}

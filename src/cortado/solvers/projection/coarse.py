@@ -66,7 +66,6 @@ class Coarse:
         """``warm`` is 1 for each scene in which the step starts from an earlier pressure."""
         self._all_warm = wp.zeros(1, dtype=wp.int32, device=device)
         self._none = self.numbers()
-        """Zeros as initial values of the coarse pressure."""
         self.still = layout.arrays(still=vector)["still"]
         self.unmoved = layout.arrays(carried=real)
         self.source = layout.arrays(s_value=real, s_slope=vector, s_bent=vector, s_own=real)

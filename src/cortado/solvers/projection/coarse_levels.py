@@ -177,7 +177,6 @@ class Levels:
         """Contributions of the finest level's cells to the matrix (pairs of corners, cells), and the right-hand side
         (nodes,)."""
         self.B = numbers(rows * counts[0]).reshape((rows, counts[0]))
-        """Matrix of free bodies (rows, nodes)."""
         self.count = wp.zeros(members, dtype=wp.int32, device=device)
         """Array of shape (members,) with the number of iterations in each scene's last solve."""
         table = [[*n, *factor] for n, factor in zip(shapes, factors, strict=True)]

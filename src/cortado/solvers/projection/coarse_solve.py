@@ -17,7 +17,6 @@ from cortado.device.modules import kernel_module
 from cortado.device.precision import Precision
 
 BLOCK = 512
-"""Number of threads in a GPU block."""
 ALONE = 4 * BLOCK
 """A single GPU block works on a level with at most this number of nodes."""
 
@@ -32,7 +31,6 @@ ON_A_CPU = """
         return T(total);
     };
 """
-"""C++ definitions for `SOLVE` on a CPU."""
 ON_A_GPU = """
     __shared__ T room[BLOCK];
     const int first = blockIdx.x / system.team, teams = gridDim.x / system.team, rank = blockIdx.x % system.team;
@@ -226,14 +224,11 @@ def system_type(precision: Precision) -> Any:
         team: wp.int32
         A: numbers
         weight: numbers
-        """Jacobi weights of nodes."""
         residual: numbers
         x_values: numbers
         z_values: numbers
         direction: numbers
-        """Search direction of conjugate gradients."""
         image: numbers
-        """Product of the matrix and the search direction."""
         rows: wp.int32
         B: numbers
         """Rows of the matrix of rigid bodies, one after the other."""

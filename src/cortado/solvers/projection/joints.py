@@ -42,10 +42,8 @@ class JointArrays:
         many = {"blocks": (rows * rows, matrix), "wanted": (rows, vector), "pushes": (rows, vector)}
         sizes = {f"{name}{suffix}": ((count, layout.members), kind) for name, (count, kind) in many.items()}
         self.whole = zeros(sizes, layout.device)
-        """Matrix, right-hand side and momenta of all equations."""
         blocks, wanted, pushes = self.whole.values()
         self.entries = [{f"wanted{suffix}": wanted[k], f"push{suffix}": pushes[k]} for k in range(rows)]
-        """Right-hand side ``wanted`` and momentum ``push`` of each equation."""
         self.blocks = {(k, n): {f"block{suffix}": blocks[k * rows + n]} for k in range(rows) for n in range(rows)}
 
     def side(self, k: int, other: bool) -> Arrays:
@@ -108,7 +106,7 @@ class Joints:
         return self.part.bodies[body].table.weight
 
     def frames(self, step: StepContext) -> Iterator[tuple[int, Row, Any, tuple[Named, ...]]]:
-        """Yield the number of each equation, the equation, its kernels, and their arguments."""
+        """Yield the number of each equation, the equation, and the kernels and arguments of the equation."""
         vector, each = self.layout.precision.vector, self.part.made_of.walls.each
         for k, row in enumerate(self.rows):
             joint = row.joint

@@ -13,7 +13,7 @@ from cortado.scene.scene import Scene
 
 MARGIN = 1.05
 SMOOTHED = 1.0 / 3.0
-"""Repairs remove all density waves evenly that have at least this relative stiffness."""
+"""Relative stiffness from which repairs remove density waves evenly."""
 DEPARTURE = 0.05
 """Regularisation of the diagonal of the pressure iteration, relative to its value on the lattice."""
 
@@ -22,7 +22,6 @@ DEPARTURE = 0.05
 class ProjectionConstants:
     spacing: float
     relaxation: float
-    """Relaxation factor of the Jacobi iteration [-]."""
     least_diagonal: float
     """Regularisation of the diagonal of the pressure iteration [1 / m2]."""
     nearest_weight: float
@@ -53,7 +52,6 @@ SPACING = 2.0
 
 
 def endless(discrete: DiscreteScene) -> bool:
-    """Test if all axes are periodic."""
     return bool((np.asarray(discrete.periods) > 0.0).all())
 
 

@@ -244,7 +244,6 @@ class ProjectionAdjoint(ParticleAdjoint):
         solver.coarse.where_due(k, correct)
 
     def _diverge(self, context: StepContext, kernel: wp.Kernel, at: Named, more: Named) -> None:
-        """Convert the adjoint of the divergence to the adjoint of velocities."""
         own, known = self._own, self._known
         context.launch(kernel, more, at, *known)
         self._faces.add(context, self.bar, *known, u=at["u"], spread=own["d_bar"])

@@ -49,7 +49,7 @@ GREATEST = 0.5
 FARTHEST = 0.1
 """Greatest shift of a particle in a step [spacings]."""
 SURFACE = 0.03
-"""Magnitude of the surface normal vector times the spacing. Below this value a particle has no surface direction."""
+"""Magnitude of the surface normal vector times the spacing, below which a particle has no surface direction."""
 AWAY = 4.0
 """Additional factor for moving close pairs apart."""
 LEAST = 1e-5
@@ -245,7 +245,6 @@ class ProjectionSteps(ParticleSolver):
         return self._context.parameters
 
     def predict(self, state: State, parameters: Parameters) -> StepContext:
-        """Compute a step up to the pressure iterations."""
         context = self.sort(state, parameters)
         if self.bodies is not None:
             self.bodies.begin(context, self.carried[IMPULSE])
@@ -288,7 +287,6 @@ class ProjectionSteps(ParticleSolver):
         first["c"].zero_()
 
     def end_of(self, slot: int) -> dict[str, wp.array]:
-        """Return the pressures, velocities and velocity gradients of the last iteration."""
         end = self.iterates[slot]
         return {"k": end["k"], "v_new": end["u"], "A": self.corrected[max(slot - 1, 0)]["A"]}
 

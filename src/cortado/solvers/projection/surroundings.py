@@ -22,7 +22,6 @@ from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 
 def entries(precision: Precision) -> dict[str, Any]:
-    """Return the Warp types of a particle's surroundings by name."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
     own = {"M": matrix, "Q": matrix, "g": vector, "gamma": vector, "nu": real, "drift": real}
     own |= {"normal": vector, "whole": vector, "normal_drift": real, "whole_drift": real, "edge": real}

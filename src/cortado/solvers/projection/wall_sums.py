@@ -44,7 +44,8 @@ from cortado.sph.moment_functions import moment_functions, symmetric
 from cortado.sph.parts import Adjoints, StepContext, Tangents
 
 EDGED = (0.1, 0.4)
-"""Fraction of the wall gradient across the normals: a wall is flat up to the first, and an edge from the second."""
+"""Fractions of the wall gradient across the normals: a wall is flat up to the first fraction, and an edge from the
+second fraction."""
 DIRECTION = 0.01
 """Relative size of the wall gradient below which the direction of a wall is unknown."""
 
