@@ -35,7 +35,7 @@ class Ensemble:
 
     Let N be the number of components of all parameters. The deviations from the given parameters, divided by their
     spreads, are drawn from a ball of radius sqrt(N). A normal random number is added to every coordinate of the initial
-    positions. Samples come in antithetic pairs and are the same in every call.
+    positions. Samples come in antithetic pairs, and every call uses the same samples.
     """
 
     spread: float | Mapping[str, float] = 0.5
@@ -87,7 +87,7 @@ class Ensemble:
         return Sampler(values, spreads, start, position_noise, np.random.default_rng([self.seed, draw]))
 
     def evaluated(self, problem: Differentiable, points: Iterable[Point], observe: Observer | None) -> list[Estimate]:
-        """Return the estimates at the points. With ``observe`` all runs are computed in this process."""
+        """Return the estimates at the points. With ``observe``, this process computes all runs."""
         return evaluated(problem, points, self.executor if observe is None else InProcess(), observe)
 
     def require_memory(self, runs: int, numbers: int) -> None:

@@ -102,8 +102,8 @@ class Batchable(Protocol):
     def together(
         self, points: Sequence[Values], estimator: "AdjointEstimator | None" = None
     ) -> list[Estimate | DivergedError]:
-        """Return estimates at points with equal parameter names and shapes. The results are bitwise equal to separate
-        runs. A point with a lost particle has its error as the result."""
+        """Return estimates at points with equal parameter names and shapes. Each estimate has the same bits as the
+        estimate from a separate run. A point with a lost particle has its error as the result."""
 
 
 class GradientEstimator(Protocol):
@@ -126,7 +126,7 @@ def checked_reverse(estimator: "AdjointEstimator") -> "AdjointEstimator":
 
 
 def checked_estimate(found: Any, parameters: Values, batch: int | None = None) -> Estimate:
-    """Return an estimate in float64. In a batch the first axis of a gradient is the scene."""
+    """Return an estimate in float64. A gradient of a batch has a first axis for the scenes."""
     if not isinstance(found, Estimate):
         raise InputError(f"the estimator returned a {type(found).__name__}, but must return a gradients.Estimate.")
     loss = as_one_number("the estimate's loss", found.loss) if batch is None else as_numbers("losses", found.loss)
@@ -231,7 +231,7 @@ Group = tuple[Point, ...]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A function that evaluates groups of points. Error messages are the same as for single points."""
+    """A function that evaluates groups of points. Groups raise the same error messages as single points."""
 
     problem: Differentiable
     observe: Observer | None = None

@@ -134,7 +134,7 @@ class AdjointNorms:
 
 @dataclass(frozen=True)
 class Exact(AdjointEstimator):
-    """A gradient estimator: the exact adjoint of the discrete step. Repeated runs give the same bits.
+    """A gradient estimator: the exact adjoint of the discrete step. Repeated runs return bitwise equal gradients.
 
     Formula: the transposed derivative of the step. Bias: none. If neighbouring trajectories diverge, the gradient grows
     exponentially with the number of steps. Cost: every step is computed forward a second time. A backward step has
@@ -217,8 +217,8 @@ class AdjointViscosity(AdjointEstimator):
 
     Here x_i and v_i are positions and velocities of the state, W is the smoothing kernel with the support radius h, and
     dt is the time step. s_i is the strength of the viscosity, gamma_i the strain rate, w_ij a weight, and S_i a kernel
-    sum. The weights are symmetric and sum to at most 1, and the strength is at most 0.6. The sum of a_i is therefore
-    conserved, and the norm of a does not grow.
+    sum. The weights are symmetric and sum to at most 1, and the strength is at most 0.6. The viscosity therefore
+    conserves the sum of the a_i, and does not increase the norm of a.
 
     After the blending, the length of each vector a_i is limited to ``limit`` times the root mean square over all
     particles. In a flow without strain the adjoints are not limited. `docs/gradients.md` explains both.
@@ -240,7 +240,7 @@ class AdjointViscosity(AdjointEstimator):
     """
 
     coefficient: float = 2.0
-    """Coefficient of the viscosity, at least 0. With 0 the gradient is the same as with `Exact`."""
+    """Coefficient of the viscosity, at least 0. With the coefficient 0, the gradient is the gradient of `Exact`."""
     limit: float = 4.0
     """Greatest length of a particle's adjoint vector, relative to the root mean square; infinity for no limit."""
     order: int = 1

@@ -117,7 +117,7 @@ class StepBar:
     row: int
     """Number of the step in the run, counted from 0."""
     parameters: Mapping[str, np.ndarray]
-    """Derivatives by parameter name, for one step. In a batch the first axis is the scene."""
+    """Derivatives by parameter name, for one step. A batch adds a first axis for the scenes."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -185,8 +185,8 @@ def slope(bar: Adjoint, dots: Mapping[str, np.ndarray], leading: tuple[int, ...]
 class Loss(Protocol):
     """Protocol of a loss, which is a differentiable number computed from the last state of a trajectory.
 
-    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`. The method returns only the
-    derivatives.
+    A user-defined loss may have a method ``adjoint(end)`` instead of `value_and_adjoint`. `adjoint` returns only the
+    derivatives of the loss.
     """
 
     def value(self, end: Snapshot) -> float:

@@ -111,7 +111,7 @@ class Discretisation:
 
 @cache
 def neighbourhood_type(precision: Precision) -> Any:
-    """The arrays of a neighbourhood are sorted by cell."""
+    """A neighbourhood has its arrays sorted by cell."""
     real, vector, matrix = precision.real, precision.vector, precision.matrix
 
     class Neighbourhood:

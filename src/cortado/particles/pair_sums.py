@@ -23,7 +23,7 @@ weight of the wall particle. If walls have no separate term, every value with in
 parameters must not begin with an underscore.
 
 With ``ahead=False`` the values of a neighbour are loaded just before its term is computed. With ``ahead=True`` the
-values are loaded earlier, which is quicker for cheap terms.
+values of a neighbour are loaded earlier, which is quicker for cheap terms.
 
 Derivatives of sums are handwritten (`tangent_of`, `adjoint_of`) where derivatives by Warp
 (`cortado.particles.made_derivatives`) would slow down a step. Tests compare all derivatives in `BY_HAND` with Warp's.

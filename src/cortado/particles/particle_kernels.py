@@ -89,7 +89,8 @@ class Over:
 
 
 def over(function: Any, names: str, /, **renamed: str) -> Over:
-    """``names`` are the results of the sum, separated by spaces. ``renamed`` are the kernel's names for arguments."""
+    """``names`` are the names of the sum's results, separated by spaces. ``renamed`` are the kernel's names for
+    arguments."""
     return Over(function, names.split(), renamed)
 
 
@@ -212,9 +213,9 @@ class _Arguments:
 def pointwise_kernels(
     precision: Precision, modules: Modules, make: Maker, results: Names, replaced: Types | None = None, **names: Any
 ) -> Kernels:
-    """``make(module)`` returns the function. ``results`` are the names of the arrays that the function writes.
-    ``replaced`` maps a result to an input that shares its adjoint array. The remaining ``names`` are the fields of
-    `Kinds`."""
+    """``make(module)`` returns the function of the kernel. ``results`` are the names of the arrays that the function
+    writes. ``replaced`` maps a result to an input that shares its adjoint array. The remaining ``names`` are the fields
+    of `Kinds`."""
     terms = [Term.of(make(module)) for module in modules]
     of = _Pointwise(precision, terms[0], results, Kinds(replaced or {}, **names), modules[0].options["enable_backward"])
     texts: Sequence[Any] = (of.forward(), of.tangent(), of.adjoint())

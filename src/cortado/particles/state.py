@@ -194,13 +194,13 @@ class State(Arrays):
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make a later state of this run with uninitialised arrays. The earlier and the later state share the arrays of
-        constant fields."""
+        """Make a later state of the same run with uninitialised arrays. The earlier and the later state share the
+        arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
     def copy(self, earlier: Self | None = None) -> Self:
-        """Copy this state to new arrays. Constant fields are shared with an ``earlier`` state of the run."""
+        """Copy the state to new arrays. Constant fields are shared with an ``earlier`` state of the run."""
         kept = {} if earlier is None else {f.name: earlier[f.name] for f in self.fields if f.is_constant}
         own = {name: kept[name] if name in kept else wp.clone(self[name], requires_grad=False) for name in self.names}
         return type(self)(self.fields, own, self.batch)
@@ -241,7 +241,7 @@ class State(Arrays):
         return {name: array.copy() for name, array in self.views(dimension, only).items()}
 
     def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Return fields as `numpy` does. If the state is on the host, the arrays are views."""
+        """Return fields as `numpy` does. The arrays are views if the state is on the host."""
         names, lead = set(self.names if only is None else only), () if self.batch is None else (self.batch, -1)
         arrays = {f: self[f.name].numpy() for f in self.fields if f.name in names}
         narrow = {f.name: a[:, :dimension] if f.entry is Entry.VECTOR else a for f, a in arrays.items()}

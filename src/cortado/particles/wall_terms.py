@@ -217,7 +217,7 @@ class SolidShares:
         return found
 
     def add_whole(self, solid: int, **given: wp.array) -> None:
-        """Add values (members,) to the adjoints of a solid. The names of the values are in `BARS`."""
+        """Add values (members,) to the adjoints of a solid. `BARS` has the names of the values."""
         for bar, one in given.items():
             add(one, self._whole[solid][bar])
 
@@ -234,8 +234,8 @@ def share_kinds(precision: Precision) -> dict[str, Any]:
 def solid_kernel(
     discretisation: Discretisation, topic: str, make: WorkMaker, rubs: bool = False, looped: bool = False
 ) -> Any:
-    """``make(discretisation)`` returns the function that computes the work of a wall term. The function may call only
-    functions that Warp can differentiate."""
+    """``make(discretisation)`` returns the function that computes the work of a wall term. The function of the work may
+    call only functions that Warp can differentiate."""
     d = replace(discretisation, lanes=1, taped=True)
     precision, term = d.precision, Term.of(make(d))
     real, vector, matrix, pair = precision.real, precision.vector, precision.matrix, precision.pair

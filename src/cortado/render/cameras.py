@@ -265,7 +265,7 @@ class ViewTangent:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Unknown properties of a view as parameters. The view ``aimed`` has approximate values of these properties.
+    """Unknown properties of a view as parameters. The view ``aimed`` has approximate values of the unknown properties.
 
     The possible parameters are "translation" (3,) [m] and "rotation" (3,) [rad] of the camera, and the "extinction" of
     the fluid [1/m]. A perspective camera also has the "field_of_view" [degrees], and a camera with parallel rays has

@@ -160,7 +160,7 @@ class DeviceState:
 
     def __getitem__(self, name: str) -> wp.array:
         """Return a field by name. Vectors have the shape (n, 3), mass fractions (n, phases), and scalars (n,). For a
-        batch, the first axis counts the scenes."""
+        batch, the first axis of the result counts the scenes."""
         if name not in self.arrays.names:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.arrays.names)}.")
         return self.arrays.numbers(name)
@@ -207,7 +207,7 @@ class DeviceStates(HostStates):
         return {name: own.numbers(name) for name in own.names}
 
     def replaced(self, space: ParameterSpace, state: DeviceState, fields: Values) -> DeviceState:
-        """Replace ``fields`` of a device state, and check the result on the host."""
+        """Replace ``fields`` of a device state, and check the new state on the host."""
         given = require_fields("state", fields, state.arrays)
         copy_to(state.arrays, "state", given)
         densities = np.array([scene.origin.rest_density for scene in state.scenes if scene.origin])
@@ -278,7 +278,7 @@ def _without_lost(lost: OfLost, state: State) -> State:
 
 
 def flat_of(arrays: Sequence[Any]) -> wp.array | None:
-    """Return a flat Warp array in the memory of ``arrays``. Return None if the arrays are not contiguous in memory."""
+    """Return a flat Warp array in the memory of ``arrays``. Return None if ``arrays`` are not contiguous in memory."""
     first = arrays[0] if arrays else None
     if not isinstance(first, wp.array) or not all(array.size for array in arrays):
         return None
@@ -315,7 +315,8 @@ class DeviceRows:
     """Parameters over time as Warp arrays on the device, in the simulation's precision. A parameter with one number has
     the shape (1,).
 
-    The values are not checked. A value may be infinite, or may move a solid too far in a time step.
+    The values of parameters on the device are not checked. A value may be infinite, or may move a solid too far in a
+    time step.
     """
 
     def __init__(self, simulation: Simulated, space: ParameterSpace):

@@ -218,7 +218,8 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """Return tangents of the first state and of parameters. The next call overwrites the second result."""
+        """Return tangents of the first state and of parameters. The next call overwrites the returned tangents of
+        parameters."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]

@@ -278,7 +278,7 @@ class Rollout(Staying):
     @in_turn
     def backward(self, derivative: BackwardStep, bars: Mapping[int, State], observe: Observer | None = None) -> State:
         """Return the adjoint of the first state. ``bars`` maps numbers of states to adjoints of the states. The next
-        backward pass overwrites the result.
+        backward pass overwrites the returned adjoint.
 
         ``observe`` is called with the adjoint of every state, from the last to the first. Raises `InputError` unless
         ``forward`` has run to the end with ``keep``, the current first state and the current parameters.

@@ -133,7 +133,7 @@ def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) 
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Make a rollout use adaptive time steps. Before this call, set the clocks and first states."""
+    """Make a rollout use adaptive time steps. Set the clocks and first states before a call of this method."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius

@@ -145,7 +145,8 @@ class StepSizes:
     def begin_at(self, state: State) -> None: ...
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Continue after ``step`` steps of lengths ``sizes`` (step,) [s]. Return True if the run ends here."""
+        """Continue after ``step`` steps of lengths ``sizes`` (step,) [s]. Return True if the run ends after these
+        steps."""
         return False
 
     def choose(self, state: State) -> None: ...

@@ -73,7 +73,8 @@ def backward_step(rollout: Rollout, estimator: ReverseEstimator | None) -> Backw
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepResidual(Staying):
-    """The stored data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`. Further steps do not change the data."""
+    """The stored data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`. The residual does not change in further
+    steps."""
 
     evaluation: Residual
     values: Arrays
@@ -322,11 +323,11 @@ class Stepping:
     def on_device(
         self, state: Given | DeviceState = None, fields: Values | None = None, parameters: Values | None = None
     ) -> DeviceState:
-        """Return a state in arrays on the device, for other programs with DLPack. The default is the first state. Steps
-        from the returned state stay on the device.
+        """Return a state in arrays on the device, for other programs with DLPack. By default, the state is the first
+        state of a run. Steps from the returned state stay on the device.
 
         ``fields`` are arrays with the DLPack interface that replace fields of the state: (n, 3) for vectors, (n,
-        phases) for fractions, (n,) for numbers. For a batch, each array has a first axis for the scenes. The arrays
+        phases) for fractions, (n,) for numbers. For a batch, each array has a first axis for the scenes. Each array
         must have the precision and the device of the simulation. The new state is checked on the host. ``parameters``
         are the parameters of the run to which the state belongs. Raises `InputError` for invalid input.
         """

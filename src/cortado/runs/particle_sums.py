@@ -235,7 +235,7 @@ class Summed(Sensor):
 
 
 class LoadSensor(Summed):
-    """Base class of sensors of a force and its torque. In 2-D, the values are per metre of thickness."""
+    """Base class of sensors of a force and its torque. In 2-D, force and torque are per metre of thickness."""
 
     def columns(self, dimension: int) -> dict[str, str]:
         force, torque = ("N", "N m") if dimension == 3 else ("N/m", "N")

@@ -60,7 +60,8 @@ class Moment:
         return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
-        """Return a quantity as a read-only float64 array. For a batch, the first axis counts the scenes."""
+        """Return a quantity as a read-only float64 array. For a batch, the first axis of the result counts the
+        scenes."""
         if name not in self._values:
             self.wanted.add(name)
             names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
@@ -79,7 +80,7 @@ def _needs_the_step(name: str) -> bool:
 
 class QuantityEvaluator:
     """Computes quantities in the arrays of a solver, so that no run may use the solver meanwhile. Results are in the
-    order of the scene. For a batch, the first axis counts the scenes."""
+    order of the scene. For a batch, the first axis of the result counts the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
         if not isinstance(solver, ParticleSolver):
@@ -278,8 +279,8 @@ class QuantityEvaluator:
 
 
 def row_of(rollout: Rollout, values: Mapping[str, NDArray], row: int) -> Arrays:
-    """Return the values of parameters in a time step. The first ``row`` is 0. After the last step, values stay
-    constant, but paths of solids are extrapolated."""
+    """Return the values of the parameters of a run in one time step. The first step has the ``row`` 0. After the last
+    step, values stay constant, but paths of solids are extrapolated."""
     found = {}
     for name, value in values.items():
         shares = _shares_of_rows(rollout, name, row, value) or {}

@@ -75,9 +75,9 @@ class RunFolder:
         device: str = "",
         overwrite: bool = False,
     ) -> Self:
-        """Make the folder of a new run of the command ``kind``. A resumed run must have the same kind and ``settings``.
-        ``overwrite`` removes the files of an earlier run. Raises `InputError` if the folder contains files that the run
-        would replace."""
+        """Make the folder of a new run of the command ``kind``. If a run is resumed, the kind and the ``settings`` must
+        be those of the first command. ``overwrite`` removes the files of an earlier run. Raises `InputError` if the
+        folder contains files that the run would replace."""
         folder = cls(Path(path).absolute())
         noted = {**session(command, device), "kind": kind, "settings": as_json(settings or {}), "resumed": []}
         noted["files"] = {table[key]: _mark(table[key]) for table, key in files_named(json.loads(scene_json))}
@@ -106,7 +106,7 @@ class RunFolder:
         settings: Mapping[str, Any] | None = None,
         device: str = "",
     ) -> Self:
-        """Open the folder of a run, and add this process to environment.json. Arguments are as in `create`."""
+        """Open the folder of a run, and record the new process in environment.json. Arguments are as in `create`."""
         folder = cls.open(path, TO_RESUME)
         folder.require(scene_json, kind, settings)
         noted = read_json(folder.environment)
@@ -148,7 +148,7 @@ class RunFolder:
             write_atomically(self.sensors, as_csv(readings))
 
     def read_sensors(self) -> dict[str, Readings]:
-        """Read sensors.csv without loss of digits. Return an empty table if the file does not exist."""
+        """Read sensors.csv without loss of digits. Return an empty table if sensors.csv does not exist."""
         return from_csv(self.sensors) if self.sensors.exists() else {}
 
     def read_scene(self, overrides: Sequence[str] = ()) -> Scene:

@@ -232,7 +232,7 @@ class MeasuredColumn:
     values: NDArray[Any]
     """Measured values (k,)."""
     simulated: NDArray[Any]
-    """Readings of the sensor at the same times (k,), linearly interpolated."""
+    """Readings of the sensor at the times of the measured values (k,), linearly interpolated."""
     left_out: int
 
     @property
@@ -283,7 +283,7 @@ def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[Measur
 def measured_columns(
     path: Path, units: Mapping[str, str], own: str = "", sensors: Collection[str] = ()
 ) -> dict[str, NDArray[Any]]:
-    """Return columns (lines,) by name. The names in the table may begin with ``own`` and end with a unit."""
+    """Return columns (lines,) by name. Column names in the file may begin with ``own`` and end with a unit."""
     found: dict[str, NDArray[Any]] = {}
     for head, values in read_columns(path).items():
         name, unit = name_and_unit(head)

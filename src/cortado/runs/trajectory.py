@@ -82,7 +82,7 @@ class Trajectory:
     """The recorded frames of a run, and the solver's diagnostics of every step.
 
     ``trajectory[k]`` is the `Frame` k; a negative k counts from the end. ``trajectory[2:5]`` and ``trajectory[::10]``
-    are trajectories of only these frames. ``len``, ``for`` and ``reversed`` work on the frames.
+    are trajectories with a part of the frames. ``len``, ``for`` and ``reversed`` work on the frames.
 
     Raises:
         InputError: the shapes of the arrays do not match.
@@ -189,8 +189,8 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """Return the times (frames,) [s] of the frames in films. For a run with ``--fps`` the result is the due times,
-        otherwise ``times``."""
+        """Return the times (frames,) [s] of the frames in films. The times are due times for a run with ``--fps``, and
+        ``times`` for any other run."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
@@ -257,7 +257,7 @@ class Trajectory:
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
         """Export the surface of the fluid, its particles and the solids to other programs; see `docs/into_blender.md`.
-        Colours are as in pictures. Return the file to open, or the folder of a series of files.
+        Colours are as in pictures. Return the path of the file to open, or the folder of a series of files.
 
         ``to`` is "usd" for one file with time samples, or "ply", "obj", "glb" or "vtp" for one file per frame. With
         "vtp", a file ``run.pvd`` for ParaView is added. ``scene`` is the scene or the path of its file. A trajectory

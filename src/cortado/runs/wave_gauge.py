@@ -164,7 +164,7 @@ class Column:
 
     @cached_property
     def _ends(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Heights [levels] and depths of fluid [m], between which the height is linear in the depth."""
+        """Heights [levels] and depths of fluid [m] at the corners of the piecewise linear function height(depth)."""
         filled = self.axis.step * np.concatenate([[0.0], np.cumsum(self.room)])
         kept, blocked = np.ones(len(filled), dtype=bool), np.append(self.room < 1e-3, False)  # full
         kept[: int(np.argmin(blocked))] = False  # what stands on the floor

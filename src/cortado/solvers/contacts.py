@@ -13,9 +13,9 @@ the other solid. A body in contact oscillates with the angular frequency sqrt(q)
 of the weight one half, because surface points of each body are inside the other body.
 
 *Restitution*: The product of beta - 1 and the growth of D in the step is added to D. The factor beta is a function of
-the coefficient of restitution e. This function is fitted to simulated impacts on a wall, so that a body rebounds at e
-times its speed. For e from 0.03 to 0.95, the error of the fit is at most 0.004. For e = 1 a body rebounds at 0.98 times
-its speed.
+the coefficient of restitution e. The function beta(e) is fitted to simulated impacts on a wall, so that a body rebounds
+at e times its speed. For e from 0.03 to 0.95, the error of the fit is at most 0.004. For e = 1 a body rebounds at 0.98
+times its speed.
 
 *Friction* (Coulomb): The momentum Q = sum_j w_j (m_j u_j + M g dt) would stop all slip. Point j slips with the velocity
 u_j and has the effective mass m_j. The term M g dt, with gravity g along the face, is zero if the other solid is free.

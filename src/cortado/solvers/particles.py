@@ -52,7 +52,7 @@ class ParticleSystem:
 
 
 class ParticleSolver(Staying):
-    """The base class of particle solvers. Every step reuses the same arrays.
+    """The base class of particle solvers. Every step reuses the arrays of the solver.
 
     `Solver` documents the methods. A subclass defines `step`, `replay` and `write_state`. A subclass with loops also
     defines `reserve`. A subclass with derivatives also defines `tangent`, `adjoint` and `differentiable`.
@@ -91,7 +91,8 @@ class ParticleSolver(Staying):
         if layout.phases == 1:
             self.fractions.fill_(1.0)
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
-        """Partial sums of accelerations. The array with index t is the sum over the first t forces."""
+        """Partial sums of accelerations. The array with index t is the sum of the accelerations by the first t
+        forces."""
         self.loops: tuple[Loop, ...] = ()
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
@@ -245,7 +246,8 @@ class ParticleSolver(Staying):
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
         """Return an array of shape (n,) with densities [kg / m3] in scene order, for a batch one scene after the other.
-        Moving solids are at their poses at the end of step ``step``. The call overwrites the arrays of the solver."""
+        Moving solids are at their poses at the end of step ``step``. `densities` overwrites the arrays of the
+        solver."""
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():

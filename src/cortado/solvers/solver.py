@@ -48,7 +48,7 @@ class StepLog(Protocol):
         device when needed."""
 
     def assign(self, other: Self) -> None:
-        """Copy the diagnostics from a log of the same solver and length."""
+        """Copy the diagnostics from a log of a solver of the same kind, with the same length."""
 
     def seek(self, step: int) -> Counts:
         """Return how often each loop iterated in step ``step``, and prepare the loops to repeat the step. For a batch,
@@ -60,7 +60,7 @@ class StepTangent(Protocol):
 
     A solver with pressures also has the `Tangents` ``dot``, and the methods ``pressures(rounds)`` and
     ``stresses(rounds)``. The methods return tangents of pressures on walls and for pressure sensors [Pa], for sorted
-    particles (n,). The list ``rounds`` has each scene's pressure iterations.
+    particles (n,). The list ``rounds`` has the number of pressure iterations of each scene.
     """
 
     def step(self, counts: Counts, state_dot: State, parameters: Parameters) -> None:

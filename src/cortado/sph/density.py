@@ -149,14 +149,15 @@ def _work(d: Discretisation) -> Any:
 
 
 class WallAction(Protocol):
-    """Protocol of the action of walls on particles by one force. The action is read after a step. ``solid`` is the
-    number of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
+    """Protocol of the action of walls on particles by one force. Loads on solids read the action of walls after a step.
+    ``solid`` is the number of a solid, or `cortado.particles.wall_terms.ALL_WALLS`."""
 
     def total(self, step: StepContext, solid: int) -> wp.array:
         """Return an array (n,) of one vector for each sorted particle. A force's vectors are accelerations [m/s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        """Return an array of shape (n,) with the tangents of the action. Forward mode of the step must be complete."""
+        """Return an array of shape (n,) with the tangents of the action of walls. Forward mode of the step must be
+        complete."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
         """Convert the adjoint ``total_bar`` of the action to adjoints of sorted particles, parameters and solids in
@@ -164,8 +165,7 @@ class WallAction(Protocol):
 
 
 class WallSums:
-    """A `WallAction` that sums a `WallTerm`. Each call of a method overwrites the array that the previous call
-    returned."""
+    """A `WallAction` that sums a `WallTerm`. Each call of a method overwrites the array from the previous call."""
 
     def __init__(self, term: WallTerm, layout: Layout, constants: tuple[float, float] = (0.0, 0.0)):
         self.term, self._layout, self._constants = term, layout, constants

@@ -39,7 +39,7 @@ READ_AS = {"e": "_no", "member": "i // particles", "row": "_row"}
 
 
 def theta_of(precision: Precision, ranks: Sequence[int]) -> Any:
-    """Return the Warp vector type for parameters of these ranks."""
+    """Return the Warp vector type for parameters with the given ranks."""
     return precision.fractions(max(sum(WIDTH[rank] for rank in ranks), 1))
 
 
@@ -223,13 +223,13 @@ class Formula:
     name: str
     text: str
     inputs: tuple[str, ...]
-    """Names of the first arguments: two vectors or numbers, and optionally the time."""
+    """Names of the function's first arguments: two vectors or numbers, and optionally the time."""
     fields: tuple[str, ...]
     kind: str
     parameters: tuple[str, ...]
     arrays: tuple[str, ...]
     outside: str
-    """Text with all outside values and Warp functions that the function uses."""
+    """Source code of the function, with all values and Warp functions from outside that it uses."""
     scope: Mapping[str, Any] = field(compare=False, repr=False)
     phases: int = 0
     ranks: tuple[int, ...] = ()
@@ -238,7 +238,8 @@ class Formula:
     """Part of the names of Warp modules for a law of viscosity; empty for Newtonian fluids."""
 
     def of_phases(self, what: str, phases: int) -> "Formula":
-        """Return the formula for this number of phases. Raise `InputError` if the function needs a different number."""
+        """Return the formula for the given number of phases. Raise `InputError` if the function needs another number of
+        phases."""
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
@@ -274,7 +275,7 @@ class Formula:
 def formula(
     kind: str, function: FunctionType, source: str, parameters: Mapping[str, Any]
 ) -> tuple[Formula, dict[str, Any]]:
-    """Return the formula and the values of parameters. Raise `InputError` if the function is invalid."""
+    """Return the formula of a function and the values of its parameters. Raise `InputError` for an invalid function."""
     what = f"{kind} function {function.__name__}"
     taken, values = _arguments(what, function, parameters, INPUTS[kind])
     inputs = tuple(name for name in taken if name not in INPUTS[kind].fields)
@@ -363,7 +364,7 @@ def compiled(what: str, module: Any, device: Any, returned: str = "vector") -> N
 
 
 def applied(text: Formula, precision: Precision, dimension: int, module: Any) -> Any:
-    """Make the Warp function that calls a user's function. In 2-D the z component of the result is 0."""
+    """Make the Warp function that calls a user's function. In 2-D the z component of the function's result is 0."""
     timed, of_numbers = len(text.inputs) == 3, text.kind == "number"
     types = tuple(precision.vector if rank else precision.real for rank in text.ranks[timed:])
     terms, first = [], 0

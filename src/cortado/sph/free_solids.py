@@ -162,7 +162,8 @@ class Push(Protocol):
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
-    """Return the momenta of two rigid bodies by kernel argument name. An ``other`` of -1 gives the first body twice."""
+    """Return the momenta of two rigid bodies by kernel argument name. For an ``other`` of -1, the momenta of the first
+    body are returned twice."""
     others = each[body if other < 0 else other].given
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 

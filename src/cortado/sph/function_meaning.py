@@ -228,7 +228,7 @@ def text_for_warp(
 ) -> str:
     """Return the source code of a user's function for Warp. ``shapes`` are the shapes of arrays by name. Raise
     `InputError` for code that Warp does not support, cannot differentiate, or interprets differently from Python. Also
-    raise `InputError` if the function may not return a ``kind``."""
+    raise `InputError` if the user's function may not return a ``kind``."""
     for helper in frozen.helpers:
         tree = helper.adj.tree
         DerivativeCheck(what).visit(tree)

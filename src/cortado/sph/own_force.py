@@ -63,7 +63,7 @@ class OverTime:
         return f"OverTime({self.times.tolist()}, {self.values.tolist()})"
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        """Return the values at ``times`` (n,) [s]."""
+        """Return the interpolated values at ``times`` (n,) [s]."""
         return self._course.at(self._moments(times))
 
     def rates(self, times: np.ndarray) -> np.ndarray:
@@ -248,8 +248,9 @@ class Body(OwnForce):
     """A force on each particle. ``function(x, v, t, ...)`` returns the acceleration [m/s2] of a particle from its
     position [m], its velocity [m/s] and the time [s].
 
-    The argument ``t`` may be left out. Arguments with these names are quantities of the particle: ``density`` [kg/m3],
-    ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]. All other arguments are parameters.
+    The argument ``t`` may be left out. Arguments with the following names are quantities of the particle: ``density``
+    [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]. All other arguments are
+    parameters.
 
     Example::
 
@@ -291,8 +292,8 @@ class Pair(OwnForce):
     a neighbour on a particle.
 
     ``x_ij`` [m] and ``v_ij`` [m/s] are the particle's position and velocity relative to the neighbour. The time ``t``
-    may be left out. The force is multiplied by a weight that falls from 1 at distance 0 to 0 at the support radius.
-    Momentum is conserved if f(-x, -v) = -f(x, v) for the function f. Walls exert no user-defined pair force.
+    may be left out. The force is multiplied by a weight that falls from 1 at distance 0 to 0 at the support radius. A
+    force f conserves momentum if f(-x, -v) = -f(x, v). Walls exert no user-defined pair force.
 
     Example::
 
@@ -322,7 +323,7 @@ class Rheology(OwnFunction):
 
     kind = "Rheology"
     replaces = "cortado.sph.viscosity"
-    """Module of the scene's force that this law replaces."""
+    """Module of the scene's force that the viscosity law replaces."""
 
     def force(self, setting: Setting) -> ViscousStress:
         """Raise `InputError` if the function cannot be compiled, or returns a negative or infinite viscosity."""

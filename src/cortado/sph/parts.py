@@ -79,7 +79,7 @@ class StepContext:
         return self.launcher.aside()
 
     def join(self) -> None:
-        """Let later launches wait for all launches made in `aside`. Every step must end with this call."""
+        """Let later launches wait for all launches made in `aside`. Every step must end with `join`."""
         self.launcher.join()
 
 
@@ -175,9 +175,9 @@ class Force(Protocol):
         A force with an acceleration that depends on ``before`` has ``is_last = True``, comes last, and returns the
         adjoint of ``before``. A force that solves a system has the attribute ``solve``; see `cortado.solvers.loop`.
 
-        A force of walls on fluid has the attribute ``wall_action``, a `cortado.sph.density.WallAction`. Without this
-        attribute, loads on solids do not include the force. If walls act at the surface instead of at the particle
-        position, ``wall_couple`` is a second `WallAction` for the moment.
+        A force of walls on fluid has the attribute ``wall_action``, a `cortado.sph.density.WallAction`. Without
+        ``wall_action``, loads on solids do not include the force. If walls act at the surface instead of at the
+        particle position, ``wall_couple`` is a second `WallAction` for the moment.
         """
 
 
@@ -201,7 +201,7 @@ class PartAdjoint:
 
     def end(self, step: StepContext, bar: Parameters, state_bar: State, moved_bar: State) -> State:
         """Apply the adjoint of `Part.end` to the adjoints of positions and velocities. Return the adjoints before the
-        part acts, and add to ``bar``. Only a part with a `Part.target` has this method."""
+        part acts, and add to ``bar``. Only a part with a `Part.target` has the method `end`."""
         return moved_bar
 
     def sort(self, step: StepContext, bar: Adjoints, state_bar: State) -> None:
@@ -229,10 +229,10 @@ class Part:
         because the step may overwrite them."""
 
     def sort(self, step: StepContext, state: State) -> None:
-        """A step calls this method when the particles are sorted."""
+        """A step calls `sort` when the particles are sorted."""
 
     def settle(self, step: StepContext) -> None:
-        """A step calls this method when neighbours and densities are known."""
+        """A step calls `settle` when neighbours and densities are known."""
 
     def target(self, moved: State) -> State:
         """Return the state from which `end` reads positions and velocities. A part that changes positions or velocities
@@ -267,7 +267,7 @@ class Carried:
     """Fields of sorted particles that a solver uses in the next step, such as a pressure."""
 
     def __init__(self, fields: Iterable[StateField], layout: Layout, requires_grad: bool = False):
-        """Allocate the arrays of the fields. Raise `TypeError` for a field without a value for each particle."""
+        """Allocate arrays for the part's fields. Raise `TypeError` for a field without a value for each particle."""
         fields = tuple(fields)
         for field in fields:
             if field.axis is not Axis.PARTICLE:

@@ -156,7 +156,7 @@ class Held:
         """Sums of the magnitudes of all particles' forces and torques on the body."""
 
     def at_rest(self) -> "Held":
-        """Return a copy with the same arrays for a body at rest."""
+        """Return a copy that shares the arrays, for a body at rest."""
         other, precision, members = copy(self), self._layout.precision, self._layout.members
         kinds = {**dict.fromkeys(("V_0", "W_0", "L_0"), precision.vector), "time_step": precision.real}
         sizes = {f"{name}{self._suffix}": (members, kind) for name, kind in kinds.items()}
@@ -193,7 +193,8 @@ class Bodies:
         return [{**held.moved, **held.faster} for held in self.held]
 
     def at_rest(self) -> "Bodies":
-        """Return a copy for bodies at rest without hinges. The result of `drifted` is then linear in the pressures."""
+        """Return a copy for bodies at rest without hinges. With the copy, the result of `drifted` is linear in the
+        pressures."""
         other = copy(self)
         other.joints = Joints(self.part, (), self.layout)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)
@@ -354,7 +355,7 @@ class BodiesAdjoint:
             clear(own.moved.values())
 
     def drifted(self, context: StepContext, drift_bar: wp.array, y: wp.array, y_bar: wp.array) -> None:
-        """Apply the adjoint of `Bodies.drifted`. The results are added to ``drift_bar`` and ``y_bar``."""
+        """Apply the adjoint of `Bodies.drifted`. The method adds adjoints to ``drift_bar`` and ``y_bar``."""
         self.carried(context, self.drift_bar, y, y_bar)
         add(self.drift_bar, drift_bar)
         self.drift_bar.zero_()

@@ -181,7 +181,7 @@ class CoarseAdjoint:
         clear(self._bars.values())
 
     def correct(self, context: StepContext, k: int, drift: Named, at: Named, new: Named) -> None:
-        """``at`` contains the adjoints before the correction, and ``new`` the adjoints after the correction."""
+        """``at`` has the adjoints before the coarse correction, and ``new`` has the adjoints after the correction."""
         own, found, known = self._coarse, self._steps, self._known
         context.launch(own.length.apply.adjoint, at, new, found, *known)
         known[0]["k_bar"].zero_()

@@ -290,7 +290,7 @@ class CoarseBodiesAdjoint:
         self._lifted = {name: wp.zeros_like(own.bodies.drift) for name in names}
 
     def add_source(self, context: StepContext, known: tuple[Named, ...], e: wp.array, multiplier: wp.array) -> None:
-        """``multiplier`` is the solution of the adjoint system."""
+        """``multiplier`` is the solution of the adjoint equations of the coarse pressure."""
         kernels, (lifted, lifted_bar, carried_bar) = self._own.kernels, self._lifted.values()
         context.launch(kernels.lift, *known, e=e, lifted=lifted, factor=1.0)
         context.launch(kernels.lift, *known, e=multiplier, lifted=carried_bar, factor=-1.0)

@@ -228,7 +228,8 @@ def beginning_kernels(discretisation: Discretisation, dimension: int) -> Kernels
     def begin(
         particles: int, spacing: real, time_step, k_before, kick_before, beside, v_star, surfaced, weights, first, warm
     ):
-        """Write the values at the start of the iterations. Set ``warm`` to 1 in scenes with a pressure."""
+        """Write pressures and velocities at the start of the pressure iterations. Set ``warm`` to 1 in scenes with a
+        pressure."""
         i, member = wp.tid(), wp.tid() // particles
         kept, pressure, _same, velocity = begun(
             spacing, time_step[member], k_before[i], kick_before[i], weights[i], beside[i], surfaced[member], v_star[i]

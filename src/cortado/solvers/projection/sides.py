@@ -208,8 +208,8 @@ class Sides:
         self._none = layout.arrays("_bar", **share_kinds(layout.precision))
 
     def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
-        """Return an array (n,) of sorted particles' corrected positions. ``x_now`` are the positions before the
-        correction."""
+        """Return an array (n,) of sorted particles' corrected positions. ``x_now`` are the positions before particles
+        are put back."""
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
             x_now = x_kept

@@ -266,7 +266,7 @@ class Maker:
         self._table = table
 
     def build(self, setting: SolverSetting) -> Solver:
-        """Without pressure, make PCISPH, which then takes equal steps."""
+        """Without pressure, make PCISPH, which takes equal steps."""
         system, table, batch = particle_system(setting), self._table, setting.batch
         if not setting.scene.forces.pressure:
             return Pcisph(system, None)

@@ -148,7 +148,8 @@ class ProjectionSteps(ParticleSolver):
         self._iterate_kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._repair_kinds = {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates: list[dict[str, wp.array]] = []
-        """Values before each pressure iteration. The last element of the list contains the result."""
+        """Values before each pressure iteration. The last element of the list has the values at the end of the
+        iterations."""
         self.corrected: list[dict[str, wp.array]] = []
         """Velocities and pressures after each coarse correction."""
         self.repaired: list[dict[str, wp.array]] = []

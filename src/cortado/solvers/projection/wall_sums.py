@@ -8,8 +8,8 @@ n_b^T g_ib) . v_b and sum w_b g_ib . v_b. The pressure of a particle pushes the 
 
 The sums normal_s and whole_s are over the wall particles of solid s. The edge factor e is computed from all walls.
 
-Flat faces of moving solids act through images of the fluid instead of wall particles. In reverse mode a sum over images
-is a work W that is linear in adjoints,
+Flat faces of moving solids act through images of the fluid instead of wall particles. For reverse mode, a sum over
+images is written as a work W, a number that is linear in the adjoints,
 
     W = sum V ((b_i + h_i c_i) W_i' + h_i d_i (u_i - R (u_j + B_j x_ij)) . g_i' + e_i swept . g_i' / dt
                - 1/2 h_i k_i (q_i + q_j) x_i' . g_i').
@@ -202,7 +202,7 @@ class ProjectionPush:
 
 
 NUMBERS = ("image", "density", "weighted", "spread", "swept", "k", "q")
-"""Names of the arrays with adjoints of image sums."""
+"""Names of the arrays with adjoints of sums over images."""
 
 
 @cache
