@@ -161,7 +161,7 @@ def test_what_does_not_fit_is_a_sentence(device):
     fields = {
         r"velocities is a float64 array \(64, 3\) on cpu, but must be a float32": {"velocities": np.zeros((n, 3))},
         r"\(64, 2\) on cpu, but must be a float32 array \(64, 3\)": {"velocities": narrow},
-        "must be an array with the DLPack interface": {"velocities": [[0.0, 0.0]]},
+        "must be an array with DLPack": {"velocities": [[0.0, 0.0]]},
         "velocities cannot be read as a DLPack array: Unsupported": {"velocities": np.array([["fast"]])},
         "not finite": {"velocities": given(simulation, single)},
         "at one place": {"positions": given(simulation, crowded)},

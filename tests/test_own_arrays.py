@@ -163,7 +163,7 @@ def test_a_pair_force_has_no_arrays():
     def pull(x_ij, v_ij, w):
         return w[0] * x_ij
 
-    with pytest.raises(InputError, match="only Body takes arrays"):
+    with pytest.raises(InputError, match="use Body for arrays"):
         Pair(pull, w=np.ones(7))
 
 

@@ -195,7 +195,7 @@ def helping_itself(r: wp.float64):
 NO_FORCES = {
     "calls itself": ("def f(x, v): return f(x, v)", "Body function f calls itself, but Warp has no recursion"),
     "calls what calls itself": ("def f(x, v): return helping_itself(x[0]) * v", "helping_itself that Body function f"),
-    "waits": ("async def f(x, v): return x", "Body function f is a coroutine or a generator, but must be a function"),
+    "waits": ("async def f(x, v): return x", "Body function f is a coroutine or a generator, but must be a plain"),
     "no axis": ("def f(x, v): return x[3] * v", r"f has x\[3\], but the index of a component must be 0, 1 or 2"),
     "order": ("def f(v, x, k): return -k * v", "f has the arguments v, x, k, but must have x, v first, and"),
     "one": ("def f(x): return x", "Body function f has x without a value, but must have"),

@@ -274,7 +274,7 @@ def test_a_sensor_of_no_spring_and_a_hinge_without_an_axis_are_sentences():
     sensor = [{"kind": "spring_force", "name": "rope", "spring": "rope"}]
     with pytest.raises(SceneError, match=r"sensor\[0\]\.spring is 'rope', but must be the name of a spring, of"):
         plane(RAFT, spring=[{**LINE, **TAUT["with a preload"]}], sensor=sensor)
-    with pytest.raises(InputError, match=r"'rope\.load' is a load on the solid 'rope'"):
+    with pytest.raises(InputError, match=r"'rope\.load' is a load on 'rope'"):
         Simulation(moored(plane, RAFT, TAUT["with a preload"])).run(2, sensors={"rope": SpringForce("rope")})
     table = {key: value for key, value in BRICK.items() if "velocity" not in key}
     pin = {"name": "pin", "solid": "raft", "position": [0.12, 0.36, 0.1], "torque": 1.0}

@@ -387,7 +387,7 @@ def test_derivatives_directions_and_residuals_that_do_not_fit_are_sentences():
     state, stepper, not_its_own = (
         simulation.state(),
         simulation.stepper(2),
-        "residual that this stepper's step returned",
+        "returned by this stepper's step",
     )
     residual, velocities = stepper.step(state)[1], {"initial_velocities": simulation.velocities}
     for call, words in [

@@ -45,7 +45,7 @@ def other_walls(x_ij: vector, strength: real) -> real:
 @pytest.mark.parametrize(
     ("make", "term", "message"),
     [
-        (fluid_sum(D), untyped, "term untyped has no type for 'c_j', but must have a type for each parameter."),
+        (fluid_sum(D), untyped, "term untyped has no type for 'c_j', but must have a type for each."),
         (fluid_sum(D), matrix, "but must return numbers or vectors of the precision."),
         (wall_sum(D), apart, "term apart has no x_ij, but needs x_ij for a sum over walls."),
         (pair_sum(D, walls=other_walls), matrix, "term other_walls of walls has strength, but must have"),

@@ -314,7 +314,7 @@ def test_what_cannot_be_is_said_in_a_sentence(tmp_path):
         (lambda: simulation.run(3, {"time_step": 0.001}), held),
         (lambda: simulation.jvp(simulation.state(), {}, {}, {"time_step": 1.0}), held),
         (lambda: cortado.Problem(simulation, 3, Spread()).tangent({}, {"time_step": 1.0}), held),
-        (lambda: cortado.Problem(simulation, 90, series), "loss is a Series with a time step of 0.001 s"),
+        (lambda: cortado.Problem(simulation, 90, series), "loss is a Series with the time step 0.001 s"),
         (lambda: cortado.certify(simulation, ["viscosity"], steps=3), "seconds for a certificate"),
         (lambda: Simulation(jet(solver=CHOSEN)).run(3, path), f"nozzle.path has a row for each .* must be {one_place}"),
         (lambda: simulation.run(), "steps is left out, but must be given, as no time"),

@@ -1,6 +1,4 @@
-"""Certificates: `certify` tests whether the gradients of a problem are right, and for how many steps gradients are
-useful.
-"""
+"""Certificates: `certify` tests whether gradients of a problem are right, and for how many steps they are useful."""
 
 from cortado.certificate.certificate import Certificate, certify
 from cortado.certificate.consistency import Consistency

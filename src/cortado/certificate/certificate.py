@@ -46,8 +46,7 @@ ROUGHLY = 0.1
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result of `certify`: whether gradients are right, for how many steps gradients are useful, and which
-    estimator to use."""
+    """The result of `certify`: correctness and horizon of gradients, and the recommended estimator."""
 
     particles: int
     steps: int
@@ -59,13 +58,13 @@ class Certificate:
     consistency: Consistency
     """Comparison of derivatives by reverse mode, forward mode and finite differences, for all parameters."""
     wrong: tuple[str, ...]
-    """Names of the parameters with a wrong derivative. Empty if all derivatives are right."""
+    """Names of the parameters with a wrong derivative. The tuple is empty if all derivatives are right."""
     norms: np.ndarray
     """Norm of the exact adjoint of the state after each step (steps + 1,)."""
     growth: float
     """Growth of the adjoint's norm in each backward step [e-folds]."""
     horizons: tuple[Horizon, ...]
-    """Horizon of each requested parameter. Empty if the adjoint is wrong."""
+    """Horizon of each requested parameter. The tuple is empty if the adjoint is wrong."""
     alignment: Alignment | None
     """Comparison of each estimator's gradient with the smoothed gradient, or None without a smoothed gradient."""
     beside: Consistency | None = None
@@ -271,7 +270,7 @@ def _consistency(
 
 
 def _beside(problem: Problem, values: Arrays, along: Arrays, random: Random) -> tuple[Consistency | None, int]:
-    """Check the derivatives at a randomly changed initial state. Also return the number of checked steps.
+    """Check the derivatives at a randomly changed initial state. Also return the number of steps that were checked.
 
     The loss of fluid at rest may have a corner, as |v| has at v = 0, where the adjoint is a one-sided derivative.
     """

@@ -107,7 +107,7 @@ class LossHistory:
 
     def sides(self, parameters: Arrays, along: Arrays, h: float, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return central differences of the loss, and distances between one-sided differences, as two arrays
-        (sample_steps,). Central differences are NaN after a run diverges. The distances are 0 for float32 losses."""
+        (sample_steps,). Central differences are NaN after a run diverges. The distances are 0 for a float32 loss."""
         differences, sums = [], []
         for loss, before, after in self._beside(parameters, along, h):
             rounded = isinstance(loss, Rounded)

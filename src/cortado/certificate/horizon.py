@@ -45,9 +45,7 @@ def checked_parameters(problem: Problem, parameters: Values | Sequence[str]) -> 
     found = ParameterSpace(simulation, problem.steps).checked({name: values[name] for name in parameters})
     for name, value in found.items():
         if not _moves_both_ways(simulation.known[name], value):
-            raise InputError(
-                f"parameter {name} is 0, but must be greater than 0: certify increases and decreases {name}."
-            )
+            raise InputError(f"parameter {name} is 0, but must be above 0: certify increases and decreases {name}.")
     return found
 
 
@@ -78,13 +76,13 @@ def scales(problem: Problem, values: Arrays, perturbation: float = PERTURBATION)
 
 
 def directions(values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return a random direction of the given size for each parameter. The direction of a scalar is positive."""
+    """Return a random direction of the given size for each parameter. A scalar has a positive direction."""
     drawn = {name: random.standard_normal(value.shape) if value.ndim else 1.0 for name, value in values.items()}
     return {name: sizes[name] * part for name, part in drawn.items()}
 
 
 def coherent_directions(problem: Problem, values: Arrays, sizes: Arrays, random: np.random.Generator) -> Arrays:
-    """Return random directions, smooth in space and constant in time. Displacements over time grow from 0."""
+    """Return random directions, smooth in space and constant in time. Displacements begin at 0."""
     x = problem.simulation.positions - problem.simulation.positions.mean(axis=0)
     x = x / (np.abs(x).max() or 1.0)
     found = directions(values, sizes, random)
@@ -203,7 +201,7 @@ class Alignment:
 
     @property
     def best(self) -> Judged | None:
-        """Estimator with the greatest merit, except `Exact`. None if all cosines are too small."""
+        """Estimator with the greatest merit, except `Exact`. The value is None if all cosines are too small."""
         good = [judged for judged in self.estimators[1:] if judged.cosine > LEAST_COSINE]
         return max(good, key=lambda judged: judged.merit, default=None)
 

@@ -42,7 +42,7 @@ class Ensemble:
     """Width of the ensemble in each parameter, in the unit of the parameter: one number, or a table by name. The width
     is sqrt((N + 2) / N) times the standard deviation of a component, where N is the number of components."""
     samples: int = 8
-    """Number of samples, at most 100,000. The memory must have room for all results."""
+    """Number of samples, at most 100,000. The memory must have room for the results of all samples."""
     position_noise: float = 0.01
     """Standard deviation of the perturbations of initial positions [spacings]."""
     seed: int = 0
@@ -170,8 +170,8 @@ MOST_NUMBERS = 64
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(Ensemble):
-    """A gradient estimator: central differences averaged over an ensemble of parameters and initial states. The
-    estimator is the reference for long runs.
+    """A gradient estimator: central differences averaged over an ensemble of parameters and initial states. Randomized
+    smoothing is the reference for long runs.
 
     Formula: let u be the parameters with N components, each divided by its spread, and L the loss. The gradient is
 

@@ -28,7 +28,7 @@ class Estimate:
     standard_error: Arrays | None = None
     """Standard error of each component of the gradient, or None if the gradient is not an average over samples."""
     degrees_of_freedom: float | None = None
-    """Number of independent samples minus one. `Guided` combines the degrees of freedom of two errors."""
+    """Number of independent samples minus one. For `Guided`, the degrees of freedom combine two errors."""
     mean_loss: float | None = None
     """Mean of the loss over the ensemble."""
     left_out: int = 0
@@ -147,7 +147,7 @@ class AdjointEstimator(ABC):
 
     @property
     def batches(self) -> bool:
-        """True if the estimator never mixes the scenes of a batch. A subclass may override this property."""
+        """True if the estimator never mixes the scenes of a batch. A subclass of estimators may override `batches`."""
         return False
 
     @abstractmethod
@@ -190,7 +190,7 @@ class Filtered:
 
 
 NO_RUN: tuple[type[Exception], ...] = (DivergedError, OutOfRangeError)
-"""Errors of a point that has no result. The remaining points are still evaluated."""
+"""Errors of a point that has no result. The remaining points of a group are still evaluated."""
 
 
 @dataclass(frozen=True)

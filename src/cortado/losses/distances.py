@@ -56,9 +56,7 @@ class FinalPositions:
         """Set the ``target`` positions (n, d) [m], in the order of the initial particles."""
         self.target = read_only("target", target)
         if self.target.ndim != 2 or not np.isfinite(self.target).all():
-            raise InputError(
-                f"target has shape {self.target.shape}, but must be a finite array (particles, dimension)."
-            )
+            raise InputError(f"target has shape {self.target.shape}, but must be finite and (particles, dimension).")
         self.fingerprint = _checksum(self.target)
         self._on_device: dict[Any, tuple[wp.array, TreeReduction]] = {}
 
@@ -155,9 +153,7 @@ def _weights(masses: np.ndarray | None) -> np.ndarray | None:
         return None
     array = _finite("masses", masses)
     if not (array >= 0.0).all() or not array.any():
-        raise InputError(
-            "masses has a number below 0, or only zeros, but must be numbers of at least 0 with a sum above 0."
-        )
+        raise InputError("masses has a number below 0, or only zeros, but must have a sum above 0.")
     return array
 
 
@@ -337,7 +333,7 @@ class Series(Frames):
 
     def __init__(self, sensor: Sensor, times: Any, values: Any, time_step: float, every: int = 1, scale: Any = 1.0):
         """Set the ``sensor`` and the measured series. ``times`` (m,) [s] must increase. ``values`` (m,) or (m, k) have
-        one number for each column of the sensor. NaN values are ignored.
+        one number for each column of the sensor. NaN values of the series do not enter the loss.
 
         ``time_step`` is the time step of the problem [s]. ``every`` is the interval between compared steps. ``scale``
         divides the differences and is a number or (k,).
@@ -353,9 +349,7 @@ class Series(Frames):
         columns, sizes = series.shape[1], as_numbers("scale", scale)
         if sizes.shape not in ((), (columns,)):
             said = f"scale has shape {sizes.shape}"
-            raise InputError(
-                f"{said}, but must be one number, or have shape ({columns},) with a number for each column."
-            )
+            raise InputError(f"{said}, but must be one number or have shape ({columns},), one for each column.")
         if not (sizes > 0.0).all():
             raise InputError("scale must be greater than 0.")
         step, stride = as_one_number("time_step", time_step), whole_number("every", every, 1)
@@ -364,9 +358,7 @@ class Series(Frames):
         first, last = int(np.ceil(moments[0] / step - 1e-9)), int(np.floor(moments[-1] / step + 1e-9))
         steps = [k for k in range(max(first, 0), last + 1) if k % stride == 0]
         if not steps:
-            raise InputError(
-                f"times go from {moments[0]:g} to {moments[-1]:g} s, but no step ends between these times."
-            )
+            raise InputError(f"times go from {moments[0]:g} to {moments[-1]:g} s, but no step ends in this interval.")
         rows = np.stack([np.interp(np.array(steps) * step, moments, column) for column in series.T], axis=1)
         weight = 1.0 / len(steps)
         self.time_step = step
@@ -376,6 +368,4 @@ class Series(Frames):
         other = time_steps[np.abs(time_steps - self.time_step) > 1e-6 * time_steps]  # rounded to float32
         if len(other):
             found = f"time_step of the series is {self.time_step:g} s"
-            raise InputError(
-                f"{found}, but must be the time step of the run, {other[0]:g} s: a series has a fixed time step."
-            )
+            raise InputError(f"{found}, but must be the fixed time step of the run, {other[0]:g} s.")

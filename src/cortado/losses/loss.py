@@ -149,12 +149,13 @@ class SnapshotAdjoint:
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
 """Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, optionally,
-mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. Missing derivatives are 0.
+mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. Missing derivatives with
+respect to state fields are 0.
 """
 
 
 def by_field(bar: Adjoint, dimension: int) -> dict[str, np.ndarray]:
-    """Return derivatives by name of a state field or quantity. Vectors have the shape (n, d)."""
+    """Return derivatives by name of a state field or quantity. Vector fields have the shape (n, d)."""
     if isinstance(bar, Mapping):
         return dict(bar)
     if isinstance(bar, SnapshotAdjoint):
@@ -218,7 +219,7 @@ class Frames:
         self.losses = FixedDict(losses)
 
     def check(self, time_steps: np.ndarray) -> None:
-        """Raise `InputError` if a loss does not suit the time steps of a run (scenes,) [s]."""
+        """Raise `InputError` if a loss cannot be computed with the time steps of a run (scenes,) [s]."""
 
     @property
     def fingerprint(self) -> str:

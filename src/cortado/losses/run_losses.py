@@ -190,9 +190,7 @@ def _checked_share(what: str, values: Any, shape: tuple[int, ...]) -> np.ndarray
     array = _checked_array(what, values, shape)
     if not np.isfinite(array).all():
         row = np.argwhere(~np.isfinite(array))[0][0]
-        raise InputError(
-            f"the loss's {what} has a value in row {row} that is not finite, but all values must be finite."
-        )
+        raise InputError(f"the loss's {what} is not finite in row {row}, but must be finite everywhere.")
     return array
 
 
@@ -206,7 +204,7 @@ class LossesByStep(dict[int, CheckedLoss]):
         if chosen and getattr(loss, "time_step", None) is not None:
             wanted = 'a loss without a time step, as solver.time_step is "auto"'
             raise InputError(
-                f"loss is a {type(loss).__name__} with a time step of {loss.time_step:g} s, but must be {wanted}."
+                f"loss is a {type(loss).__name__} with the time step {loss.time_step:g} s, but must be {wanted}."
             )
         by_step = loss.losses if isinstance(loss, Frames) else {steps: loss}
         for step in by_step:

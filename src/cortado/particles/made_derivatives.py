@@ -55,9 +55,7 @@ def made_tangent(d: Discretisation, make: TermMaker, module: Any = None) -> Any:
         for types in (term.arrays, term.others)
     )
     if len(arrays) + len(others) < 2 * len(term.arrays | term.others):
-        raise TypeError(
-            f"term {term.name} has the names x and x_dot, but only the tangent of x may have the name x_dot."
-        )
+        raise TypeError(f"term {term.name} has names x and x_dot, but x_dot must be the tangent of x.")
     kinds, real = {**term.parameters, **bars_of(term)}, d.precision.real
     moved = [name for name in term.parameters if name not in ("i", "j", "s")]
 

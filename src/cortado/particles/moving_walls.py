@@ -31,9 +31,9 @@ class WallArrays(Rows):
     positions: np.ndarray
     """Array of shape (b, 3) with positions [m]. Positions on moving solids are in the frame of the solid."""
     weights: np.ndarray
-    """Array of shape (b,) with the weights of wall particles in the density [-]. A fluid particle has 1."""
+    """Array of shape (b,) with the weights of wall particles in the density [-]. Fluid has the weight 1."""
     grips: np.ndarray
-    """Array of shape (b,) with the weights of wall particles in sums of friction [-]. Walls with free slip have 0."""
+    """Array of shape (b,) with the weights of wall particles in sums of friction [-]. Free-slip walls have 0."""
     feet: np.ndarray
     """Array of shape (b, 3) with vectors from wall particles to the nearest point on the surface [m]."""
     slides: np.ndarray

@@ -16,7 +16,7 @@ from cortado.particles.mirrors import mirror_functions
 
 @cache
 def loads(precision: Precision, taped: bool) -> SimpleNamespace:
-    """Indices must not be negative. A Warp tape can record ``taped`` functions."""
+    """Indices must not be negative. A Warp tape can record the ``taped`` functions of arrays."""
     return _of_warp(precision) if taped else _direct(precision)
 
 

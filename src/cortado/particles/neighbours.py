@@ -297,7 +297,7 @@ def image_kernel(discretisation: Discretisation) -> Any:
 
 class NeighbourSearch:
     """Lists are stored as [particle][neighbour] on a CPU and as [neighbour][particle] on a GPU. Kernels always index
-    [neighbour, particle]."""
+    the lists as [neighbour, particle]."""
 
     def __init__(
         self,
@@ -339,7 +339,7 @@ class NeighbourSearch:
         self.walls = {
             f"wall_{name}": wp.zeros(sizes[name], dtype=kind, device=device) for name, kind in {**kinds, **own}.items()
         }
-        """Arrays of wall particles by kernel argument name. Wall particles at rest come first."""
+        """Arrays of wall particles by kernel argument name. Walls at rest come before moving walls."""
         self.walls["wall_faces"].fill_(-1)
         self._write_walls(still)
         self._wall_sort = CellSort(grid, len(still), precision, device)
@@ -389,8 +389,7 @@ class NeighbourSearch:
 
     @property
     def needed(self) -> int:
-        """Return the length of the longest list since the last `forget_needed`, even if the length exceeds the
-        capacity."""
+        """Return the greatest list length since the last `forget_needed`, even beyond the capacity."""
         return int(self.needed_copy.read().max())
 
     def forget_needed(self) -> None:

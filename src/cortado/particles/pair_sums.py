@@ -59,13 +59,9 @@ class Term:
         for name in names:
             if name not in types or isinstance(types[name], str):
                 found = "a text" if name in types else "no type"
-                raise TypeError(
-                    f"term {function.__name__} has {found} for {name!r}, but must have a type for each parameter."
-                )
+                raise TypeError(f"term {function.__name__} has {found} for {name!r}, but must have a type for each.")
             if name.startswith("_"):
-                raise TypeError(
-                    f"term {function.__name__} has the parameter {name!r}, but names must not begin with an underscore."
-                )
+                raise TypeError(f"term {function.__name__} has {name!r}, but names must not begin with an underscore.")
         result = types.pop("return")
         return cls(function, types, get_args(result) or (result,))
 
@@ -88,7 +84,7 @@ class Term:
         return {name: kind for name, kind in self.parameters.items() if not array_of(name) and name not in known}
 
     def seen_from_i(self, of_j: Mapping[str, str], j: str = "_j", back: bool = False) -> str:
-        """Return the term's arguments as source text. With ``back``, the two particles exchange their roles."""
+        """Return the term's arguments as source text. With ``back``, the particles exchange roles."""
         known = {"x_ij": "_x_ij", "i": "i", "j": j, **OF_WALLS, **OF_IMAGES}
         if back:
             known = {"x_ij": "-_x_ij", "i": "_j", "j": "i"}
@@ -285,9 +281,7 @@ def pair_sum(
         more = [name for name, kind in (wall.arrays | wall.others).items() if own.get(name) != kind]
         if wall.results != term.results or more:
             found = f"has {', '.join(more)}" if more else f"returns {wall.results}"
-            raise TypeError(
-                f"term {wall.name} of walls {found}, but must have the results and parameters of {term.name}."
-            )
+            raise TypeError(f"term {wall.name} of walls {found}, but must have results and parameters of {term.name}.")
         return over_fluid(term, d, ahead) + over_walls(wall, d, grows, RUBBING if rubs else ALL)
 
     return _summing(d, typed, loops, walls, grows=grows)

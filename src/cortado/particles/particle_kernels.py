@@ -52,7 +52,7 @@ def {name}({parameters}):
 """
 MADE = "made_"
 MOST_ARRAYS = 8
-"""Greatest number of separate array arguments. Further arrays are passed in a struct."""
+"""Greatest number of separate array arguments. Kernels take further arrays in a struct."""
 TANGENT = """\
 _total_{n} = _kind_{n}()
     _components = int({components})
@@ -64,7 +64,7 @@ _total_{n} = _kind_{n}()
 
 
 def made_kernel(name: str, types: Types, body: Iterable[str], scope: Types, module: Any) -> Any:
-    """Make a Warp kernel with arguments of given types from source lines. The lines may use the names in ``scope``."""
+    """Make a Warp kernel with arguments of given types from source lines. The lines may use names in ``scope``."""
     text = KERNEL.format(name=name, parameters=", ".join(types), body="\n    ".join(body))
     known = {"wp": wp, **scope}
     exec(text, known)
@@ -230,7 +230,7 @@ def pointwise_kernels(
 
 @dataclass(frozen=True)
 class Kinds:
-    """Roles of parameters and results in pointwise kernels. All fields are optional."""
+    """Roles of parameters and results in pointwise kernels. All fields of `Kinds` are optional."""
 
     replaced: Types
     numbers: Names = ()

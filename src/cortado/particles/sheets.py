@@ -83,8 +83,7 @@ def hiding_kernel(discretisation: Discretisation) -> Any:
 
     @wp.func
     def crossed(p: vector, q: vector, own: int, member: int, s: neighbourhood, sheets: sheets_of) -> int:
-        """Return 1 if a segment crosses the sheet ``own``, 2 if the segment crosses another sheet, and 3 if the segment
-        crosses both."""
+        """Return 1 if a segment crosses the sheet ``own``, 2 if another sheet, and 3 if both."""
         found = int(0)
         for k in range(sheets.numbers.shape[0]):
             start = seen_from(p, s.before, s.turns_before, k, member, s, sheets)

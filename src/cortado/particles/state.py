@@ -98,7 +98,7 @@ def to_device(values: np.ndarray, precision: Precision, device: Any) -> wp.array
 
 
 def components(array: wp.array, shape: tuple[int, ...]) -> wp.array:
-    """Return a view of the array as scalars with the given shape. Elements may be scalars, vectors or matrices."""
+    """Return a view of the array as scalars with the given shape. Elements may be vectors or matrices."""
     real = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     view = wp.array(ptr=array.ptr, dtype=real, shape=shape, device=array.device)
     view._ref = array
@@ -168,7 +168,8 @@ class State(Arrays):
     """The arrays of a state by field name, or their tangents or adjoints.
 
     Every state has ``positions`` (n,) vectors [m], ``velocities`` (n,) vectors [m / s] and ``mass_fractions`` (n,) with
-    one number for each phase [-]. Particles are in the order of the scene. A batch has one scene after the other.
+    one number for each phase [-]. In a state, particles are in the order of the scene. A batch has the particles of one
+    scene after the other.
     """
 
     def __init__(self, fields: tuple[StateField, ...], arrays: Mapping[str, wp.array], batch: int | None = None):
@@ -194,8 +195,7 @@ class State(Arrays):
         return type(self)(self.fields, zero, self.batch)
 
     def following(self) -> Self:
-        """Make a later state of the same run with uninitialised arrays. The earlier and the later state share the
-        arrays of constant fields."""
+        """Make a later state of the run with uninitialised arrays. The states share the arrays of constant fields."""
         new = {f.name: self[f.name] if f.is_constant else wp.empty_like(self[f.name]) for f in self.fields}
         return type(self)(self.fields, new, self.batch)
 
@@ -237,7 +237,7 @@ class State(Arrays):
                 self[field.name].assign(padded(flat) if field.entry is Entry.VECTOR else flat)
 
     def numpy(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Copy every field, or the fields named in ``only``, to new arrays. The shapes are the shapes in `set`."""
+        """Copy every field, or the fields named in ``only``, to new arrays. Shapes are as in `set`."""
         return {name: array.copy() for name, array in self.views(dimension, only).items()}
 
     def views(self, dimension: int, only: Iterable[str] | None = None) -> dict[str, np.ndarray]:

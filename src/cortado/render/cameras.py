@@ -85,8 +85,8 @@ class Camera:
         raise NotImplementedError
 
     def moved(self, translation: Sequence[float] | np.ndarray, rotation: Sequence[float] | np.ndarray) -> "Camera":
-        """Return the camera after a ``translation`` (3,) [m] and a ``rotation`` about its position. The rotation is a
-        rotation vector (3,) [rad].
+        """Return the camera after a ``translation`` (3,) [m] and a ``rotation`` about its position. The rotation of the
+        camera is a rotation vector (3,) [rad].
 
         The renderer returns derivatives with respect to the translation and rotation at zero.
         """
@@ -307,7 +307,7 @@ class Calibration:
         return Volume(camera, float(all_values["extinction"]), self.aimed.background)
 
     def tangent(self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]) -> ViewTangent:
-        """Return the rate of change of the view along ``directions``. Omitted directions are 0."""
+        """Return the rate of change of the view along ``directions``. Directions that are left out are 0."""
         from scipy.spatial.transform import Rotation
 
         rotation: Vector = ZERO

@@ -165,9 +165,7 @@ class Renderer:
         if fractions is None:
             if self._phases > 1:
                 wanted = f"mass fractions ({self._particles}, {self._phases})"
-                raise InputError(
-                    f"fractions is left out, but must be {wanted}, as the fluid has {self._phases} phases."
-                )
+                raise InputError(f"fractions is left out, but must be {wanted}, with {self._phases} phases.")
             fractions = np.ones((self._particles, 1))
         colours = self._colours if colours is None else colours
         if colours is None:
@@ -184,7 +182,8 @@ class Renderer:
     def tangent(
         self, positions: Any = None, fractions: Any = None, colours: Any = None, view: ViewTangent | None = None
     ) -> np.ndarray:
-        """Return the derivative (rows, columns, 3) of the last picture along a direction. Omitted arguments are 0.
+        """Return the derivative (rows, columns, 3) of the last picture along a direction. Tangents that are left out
+        are 0.
 
         Args:
             positions: (n, d) [m], the direction of the positions.
@@ -256,7 +255,7 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 UP = {2: 2, 3: 1}
 """Index of the upward axis by dimension. In 2-D the upward axis is perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
-"""Ratio of node distance to particle spacing, by dimension. With coarser grids optimisers can get stuck."""
+"""Ratio of node distance to particle spacing, by dimension. With coarser nodes, optimisers can get stuck."""
 CLEARNESS = 8.0
 """Ratio of the scene's width to the default depth of visibility in a "volume" view."""
 CAMERA = ("position", "look_at", "field_of_view", "extinction")

@@ -18,8 +18,7 @@ MEMORY_BUDGET = 8 * 2**30
 
 
 class Checkpoints:
-    """States of a forward run at every ``interval``-th step. A backward pass recomputes the states between the stored
-    states."""
+    """States of a forward run at every ``interval``-th step. A backward pass recomputes all other states."""
 
     def __init__(self, first: State, interval: int):
         self._first, self._interval = first, interval
@@ -60,7 +59,7 @@ class Checkpoints:
         return self._states[n]()
 
     def release(self) -> list[StateSeries]:
-        """Return the stored arrays for reuse. All checkpoints become invalid."""
+        """Return the stored arrays for reuse. A release makes all checkpoints invalid."""
         copies, self._copies = self._copies, []
         return copies
 
@@ -109,7 +108,7 @@ class ChunkReader(Protocol):
 
     def read(self, step: int, end: int, first: State, later: StateSeries) -> None:
         """Read the states before the steps ``step`` to ``end`` - 1. ``first`` is the state before step ``step``, and
-        ``later`` contains the following states. The next chunk overwrites the states."""
+        ``later`` contains the following states. The next chunk overwrites the states ``first`` and ``later``."""
 
 
 def diverged(solver: Solver, member: int, lost: Lost, known: Sequence[State], advice: str) -> DivergedError:

@@ -50,7 +50,7 @@ def without_lost(lost: OfLost, found: Arrays) -> Arrays:
 States = RestartState | tuple[RestartState, ...]
 """A restart state, or a tuple with a restart state for each scene of a batch."""
 Given = RestartState | Sequence[RestartState] | None
-"""A restart state, or a sequence with a restart state for each scene of a batch. None is the scene's first state."""
+"""A restart state, or a sequence with a restart state for each scene of a batch. None means the initial state."""
 
 
 class HostStates:
@@ -87,8 +87,8 @@ class HostStates:
         return tuple(found)
 
     def write(self, what: str, given: Values, to: State) -> np.ndarray:
-        """Write derivatives by field name to a device state, and return the derivative with respect to time. Missing
-        fields are 0. Raises `InputError` for arrays of wrong shape or type."""
+        """Write derivatives by field name to a device state, and return the derivative with respect to time. Fields
+        without a given derivative get 0. Raises `InputError` for arrays of wrong shape or type."""
         fields, shapes = require_fields(what, given, to), shapes_of_fields(self._simulation, to.batch)
         arrays = {name: as_numbers(f"{what} {name}", value) for name, value in fields.items()}
         for name, array in arrays.items():
@@ -151,7 +151,8 @@ class DeviceState:
     `DeviceState`, and so do steps from a `DeviceState`.
 
     ``state["positions"]`` is a read-only Warp array. ``torch.from_dlpack`` and ``jax.dlpack.from_dlpack`` share its
-    memory. Arrays have the precision of the simulation. Vectors have three components in 2-D, too.
+    memory. Arrays of a device state have the precision of the simulation. Vectors on the device have three components
+    in 2-D, too.
     """
 
     arrays: State
@@ -159,8 +160,8 @@ class DeviceState:
     """Clock and origin of each scene, as restart states without fields."""
 
     def __getitem__(self, name: str) -> wp.array:
-        """Return a field by name. Vectors have the shape (n, 3), mass fractions (n, phases), and scalars (n,). For a
-        batch, the first axis of the result counts the scenes."""
+        """Return a field by name. Vectors have the shape (n, 3), mass fractions (n, phases), and scalars (n,). A batch
+        adds a first axis for the scenes."""
         if name not in self.arrays.names:
             raise InputError(f"state has no {shown(name)}, but has {', '.join(self.arrays.names)}.")
         return self.arrays.numbers(name)
@@ -217,7 +218,7 @@ class DeviceStates(HostStates):
         for name in vectors.intersection(given) if self._simulation.dimension == 2 else ():
             if state[name].numpy()[..., 2].any():
                 raise InputError(
-                    f"state {name} has a third component other than 0, but the third component must be 0 in 2-D."
+                    f"state {name} has a third component other than 0, but vectors are in the plane in 2-D."
                 )
         return state
 
@@ -261,9 +262,7 @@ def _taken(what: str, value: Any) -> wp.array:
     if isinstance(value, wp.array):
         return value
     if not hasattr(value, "__dlpack__"):
-        raise InputError(
-            f"{what} is {shown(value)}, but must be an array with the DLPack interface, such as a torch.Tensor."
-        )
+        raise InputError(f"{what} is {shown(value)}, but must be an array with DLPack, such as a torch.Tensor.")
     try:  # NumPy refuses DLPack for read-only arrays
         return wp.array(value, device="cpu") if isinstance(value, np.ndarray) else wp.from_dlpack(value)
     except (BufferError, RuntimeError, TypeError, ValueError) as error:

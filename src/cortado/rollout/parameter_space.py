@@ -58,8 +58,7 @@ class ParameterSpace:
         return found
 
     def _judge(self, values: Arrays) -> None:
-        """Check values for a run. Unchanged values, and a gravity weaker than the last checked gravity, are not checked
-        again."""
+        """Check values for a run. Unchanged values and a weaker gravity than before are not checked again."""
         last, strongest = self._judged or ({}, 0.0)
         is_first = self._judged is None or last.keys() != values.keys()
         gravity = values.get("gravity")
@@ -206,9 +205,7 @@ class ParameterSpace:
     def check_restarts(self, states: Sequence[RestartState], values: Arrays) -> None:
         for name in self._known.state if states else ():
             if name in values:
-                raise InputError(
-                    f"parameter {name} is given, but must be left out, as the given state has initial values."
-                )
+                raise InputError(f"parameter {name} is given, but must be left out, as the given state has values.")
         simulation = self._simulation
         for state, own in zip(states, self.members(values), strict=False):
             origin = run_checks.origin_of(
@@ -218,8 +215,7 @@ class ParameterSpace:
 
     @WARP
     def direction(self, rollout: Rollout, values: Arrays, along: Arrays) -> tuple[State, Parameters]:
-        """Return tangents of the first state and of parameters. The next call overwrites the returned tangents of
-        parameters."""
+        """Return tangents of the first state and of parameters. The next call overwrites the second tangent."""
         if self._parameters_dot is None or self._parameters_dot[0] is not rollout:
             self._parameters_dot = rollout, rollout.solver.new_parameters(self._steps)
         dot, parameters = rollout.solver.new_state(), self._parameters_dot[1]

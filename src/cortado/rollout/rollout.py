@@ -26,8 +26,7 @@ from cortado.scene.restart import Clock, Origin
 from cortado.solvers.solver import Counts, Solver, StepLog, StepTangent
 
 Observer = Callable[[int, State], None]
-"""Function that is called with the number of a state and the state. Copy the state to keep it, because later steps
-overwrite it."""
+"""Function that is called with the number of a state and the state. Later steps overwrite the state."""
 OBSERVED = "a number of steps", "a state"
 CHUNK = {"cpu": 8, "cuda": 64}
 """Greatest number of steps in a chunk, by kind of device."""
@@ -132,7 +131,7 @@ class Rollout(Staying):
         return step == self.steps or self.step_sizes.is_end(step)
 
     def begin_evaluation(self) -> None:
-        """Prepare for a new first state and new parameters. Residuals in use first copy the current values."""
+        """Prepare for a new first state and new parameters. Residuals in use copy the current values first."""
         if self.pending:
             pending = list(self.pending)
             if len(pending) > 1:
@@ -151,7 +150,7 @@ class Rollout(Staying):
         meanwhile: Callable[[], None] | None = None,
         reader: ChunkReader | None = None,
     ) -> State:
-        """Run to the last step or the end time, and return the last state. The next run overwrites the state.
+        """Run to the last step or the end time, and return the last state. The next run overwrites the returned state.
 
         ``observe`` is called with every state. ``keep`` stores checkpoints for a backward pass. ``meanwhile`` is called
         while a GPU computes. ``reader`` reads states on the device. Raises `DivergedError` if a particle is lost, after

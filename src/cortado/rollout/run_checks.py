@@ -68,7 +68,7 @@ def check_places(values: Arrays, scene: Scene, free: int) -> None:
 
 
 def unstable_sentence(values: Arrays, scene: Scene, told: set[str]) -> str | None:
-    """Return a warning about an exceeded limit of stability, or None. Exceeded limits are added to ``told``."""
+    """Return a warning about an exceeded limit of stability, or None. The function adds exceeded limits to ``told``."""
     if scene.solver.time_step == "auto":
         return None
     time_step = float(values.get("time_step", scene.solver.time_step))
@@ -115,7 +115,7 @@ class FirstPositions:
 
 
 FURTHEST = 1.0
-"""Greatest displacement of a solid in a time step [spacings]. Faster solids could pass over fluid."""
+"""Greatest displacement of a solid in a time step [spacings]. A faster solid could pass over fluid."""
 SCALES = (0.6, 1.5)
 """Smallest and greatest scale of a solid with wall particles. At other scales, fluid leaks through the solid."""
 

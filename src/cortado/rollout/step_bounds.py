@@ -59,7 +59,7 @@ def step_bounds(scene: SceneTables, values: Arrays, steps: int, least: float = 0
 
 
 def moved_by(scene: Scene, values: Arrays, courses: Mapping[str, Changing]) -> dict[str, Moved]:
-    """Return the paths of each emitter and solid. The keys are phrases such as "the emitter 'tap'"."""
+    """Return the paths of each emitter and solid. The result has keys such as "the emitter 'tap'", for messages."""
     names = [emitter.name for emitter in scene.emitter]
     found: dict[str, Moved] = {f"the emitter {name!r}": [(1.0, courses.get(path_name(name)))] for name in names}
     for solid in told(scene.solid):
@@ -133,7 +133,7 @@ def scheduled_bounds(scene: Scene, values: Arrays, parameters: SceneParameters) 
 
 
 def begin_choosing(rollout: Rollout, scene: Scene, parameters: SceneParameters, members: Sequence[Arrays]) -> None:
-    """Make a rollout use adaptive time steps. Set the clocks and first states before a call of this method."""
+    """Make a rollout use adaptive time steps. Set clocks and first states before this call."""
     if not isinstance(rollout.step_sizes, ChosenSteps):
         courant = COURANT if scene.solver.courant is None else scene.solver.courant
         length = courant * 0.5 * scene.discretisation.support_radius

@@ -145,8 +145,7 @@ class StepSizes:
     def begin_at(self, state: State) -> None: ...
 
     def go_on(self, step: int, state: State, sizes: NDArray | None) -> bool:
-        """Continue after ``step`` steps of lengths ``sizes`` (step,) [s]. Return True if the run ends after these
-        steps."""
+        """Continue after ``step`` steps of lengths ``sizes`` (step,) [s]. Return True at the end of the run."""
         return False
 
     def choose(self, state: State) -> None: ...
@@ -199,7 +198,7 @@ class ChosenSteps(StepSizes):
         self._steps, self._retaken = steps, Retaken()
 
     def begin(self, clocks: Sequence[Clock], bounds: NDArray, scheduled: Scheduled | None) -> list[Clock]:
-        """Prepare a run with upper ``bounds`` (steps, members) [s]. Return clocks that record times."""
+        """Prepare a run with upper ``bounds`` (steps, members) [s]. Return clocks that record the times of a run."""
         self._steps, room = len(bounds), len(self._bounds)
         self._bounds.assign(np.pad(bounds, ((0, room - len(bounds)), (0, 0)), mode="edge"))
         self._first.assign([clock.time_step for clock in clocks])

@@ -73,8 +73,7 @@ def backward_step(rollout: Rollout, estimator: ReverseEstimator | None) -> Backw
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StepResidual(Staying):
-    """The stored data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`. The residual does not change in further
-    steps."""
+    """The stored data of `Stepper.step` for `Stepper.vjp` and `Stepper.jvp`. Later steps do not change a residual."""
 
     evaluation: Residual
     values: Arrays
@@ -172,7 +171,7 @@ class Stepper:
     @in_turn
     def advance(self, state: Any, parameters: Values | None = None, place: HostStates | None = None) -> Any:
         """Return the state after the steps. If ``state`` is on the device, the result is on the device. Parameters over
-        time may be Warp arrays on the device, in the simulation's precision. Values in Warp arrays are not checked."""
+        time may be Warp arrays on the device, in the simulation's precision. Values in Warp arrays are unchecked."""
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, place=place)
         return place.state(self.rollout, self._forward(keep=False), self.rollout.steps, state)
@@ -193,10 +192,11 @@ class Stepper:
     def step(
         self, state: Any, parameters: Values | None = None, along: Iterable[str] = (), place: HostStates | None = None
     ) -> tuple[Any, StepResidual]:
-        """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist.
+        """Return the state after the steps, and a residual for `vjp` and `jvp`. Any number of residuals may exist at
+        the same time.
 
         ``along`` names further parameters that `jvp` may vary. Only the mobility must be named, because fluid with
-        mobility 0 is computed without diffusion. Parameters may be on the device, as in `advance`.
+        mobility 0 is computed without diffusion. Parameters may be on the device, as in `Simulation.advance`.
         """
         values, rows = self._given(parameters)
         place = self._begin(state, values, rows, {*values, *self._space.checked_names("along", along)}, place)
@@ -210,10 +210,10 @@ class Stepper:
         """Return the adjoints of the first state and of the given parameters, given the adjoint ``state_bar`` of the
         last state (reverse mode). ``gradient`` is the estimator, by default `Exact`; see `docs/gradients.md`.
 
-        The adjoint of a state is a dictionary of arrays by field name, with the shapes of the fields. The key ``time``
-        has a number. Missing fields are 0. Arrays of a `DeviceState` are on the device, and arrays on the host are in
-        float64. For a batch, each array has a first axis for the scenes. Results for a lost scene are 0 if the scene's
-        adjoint in ``state_bar`` is 0, and otherwise NaN.
+        The adjoint of a state is a dictionary of arrays by field name, with the shapes of the fields. The adjoint of a
+        state has a number under the key ``time``. Fields without a given derivative get 0. Arrays of a `DeviceState`
+        are on the device, and arrays on the host are in float64. For a batch, each array has a first axis for the
+        scenes. Results for a lost scene are 0 if the scene's adjoint in ``state_bar`` is 0, and otherwise NaN.
 
         The adjoint of a parameter on the device is also on the device, in the shape of the parameter. Raises
         `InputError` for unknown fields and for wrong shapes.
@@ -242,7 +242,7 @@ class Stepper:
     @in_turn
     def jvp(self, residual: StepResidual, state_dot: Values, parameter_dots: Values | None = None) -> dict[str, Any]:
         """Return the tangent of the last state, given the tangents of the first state and of parameters (forward mode).
-        Tangents have the form of the adjoints in `vjp`."""
+        Tangents have the same form as the adjoints in `vjp`."""
         rollout, space, place = self.rollout, self._space, self._place_of(residual)
         looked_at, rows = self._rows.split(parameter_dots, "direction")
         along = space.checked(looked_at, "direction")
@@ -263,9 +263,7 @@ class Stepper:
 
     def _place_of(self, residual: StepResidual) -> HostStates:
         if not isinstance(residual, StepResidual) or residual.evaluation.rollout is not self.rollout:
-            raise InputError(
-                f"residual is {shown(residual)}, but must be a residual that this stepper's step returned."
-            )
+            raise InputError(f"residual is {shown(residual)}, but must be returned by this stepper's step.")
         return residual.place
 
     @cached_property
@@ -328,8 +326,8 @@ class Stepping:
 
         ``fields`` are arrays with the DLPack interface that replace fields of the state: (n, 3) for vectors, (n,
         phases) for fractions, (n,) for numbers. For a batch, each array has a first axis for the scenes. Each array
-        must have the precision and the device of the simulation. The new state is checked on the host. ``parameters``
-        are the parameters of the run to which the state belongs. Raises `InputError` for invalid input.
+        must have the precision and the device of the simulation. The simulation checks the new state on the host.
+        ``parameters`` are the parameters of the run to which the state belongs. Raises `InputError` for invalid input.
         """
         return self.stepper(0).on_device(state, fields or {}, parameters)
 
@@ -351,7 +349,7 @@ class Stepping:
         For a batch, the result is a tuple with the state of each scene, and the state of a lost scene is NaN. For a
         `DeviceState`, the result is a `DeviceState`. ``parameters`` are any parameters of `Problem` except initial
         values, because ``state`` contains the initial values. A parameter over time has a first axis of length
-        ``steps``. Further calls with the same number of steps are faster. Warnings and errors are as in
+        ``steps``. Further calls with the same number of steps are faster. `advance` has the same warnings and errors as
         `Simulation.run`.
         """
         return self.stepper(check_steps(steps)).advance(state, parameters)
@@ -385,7 +383,7 @@ class Stepping:
 
     @in_turn
     def stepper(self, steps: int) -> Stepper:
-        """Return the `Stepper` for the given number of steps. The last few steppers are cached."""
+        """Return the `Stepper` for the given number of steps. The simulation caches the last few steppers."""
         steppers: dict[int, Stepper] = self.__dict__.setdefault("_steppers", {})
         found = steppers.pop(steps, None) or Stepper(cast(Simulated, self), check_steps(steps, least=0))
         steppers[steps] = found  # the last one

@@ -192,8 +192,7 @@ class Seen:
         return found / self.parts
 
     def pulled(self, factors: NDArray[Any] | float) -> NDArray[Any]:
-        """Convert derivatives with respect to weights (n,) to derivatives with respect to the vectors (n, k) from the
-        place to the particles."""
+        """Convert derivatives by weights (n,) to derivatives by the vectors (n, k) from the place to the particles."""
         each, found = np.broadcast_to(factors, self.particles), np.zeros((self.particles, self.images[0].ways.shape[1]))
         for image in self.images:
             found[image.near] += (each[image.near] * image.slopes / self.reach**2)[:, None] * image.ways
@@ -231,7 +230,7 @@ class Summed(Sensor):
 
     @abstractmethod
     def reading(self, at: Reading, found: NDArray[Any]) -> NDArray[Any]:
-        """Return the reading (k,), given the sum (6,). From the state, use only the poses of solids."""
+        """Return the reading (k,), given the sum (6,). The reading uses only the poses of solids in the state."""
 
 
 class LoadSensor(Summed):
@@ -248,8 +247,7 @@ class LoadSensor(Summed):
 
 @dataclass(frozen=True, eq=False)
 class WeightedSum:
-    """Sums around a place: the sum of the weights, and the sum of the weights times a quantity or a velocity
-    component."""
+    """Sums around a place: the sum of weights, and the sum of weights times a quantity or a velocity component."""
 
     around: Around
     quantity: str | None = None

@@ -55,8 +55,8 @@ class PressureProbe(Summed):
 
     p = sum_i p_i w_i / sum_i w_i,   w_i = w(r_i / radius).
 
-    Here p_i is the pressure of particle i, r_i its distance from the point, and w a smooth function. Without fluid
-    within the radius, the reading is 0.
+    Here p_i is the pressure of particle i, r_i its distance from the point, and w a smooth function. The reading is 0
+    without fluid within the radius.
 
     Example: ``run = simulation.run(100, sensors={"wall": cortado.sensors.PressureProbe([0.79, 0.05])})``
     """

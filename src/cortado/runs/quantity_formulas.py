@@ -42,8 +42,7 @@ SIX = wp.types.vector(6, wp.float64)
 
 @dataclass(frozen=True)
 class Bars:
-    """Adjoints of a time step's intermediate values. Formulas add the adjoints of quantities to the arrays of this
-    object."""
+    """Adjoints of a time step's intermediate values. Formulas add to these adjoints."""
 
     of: Adjoints
     p: wp.array
@@ -221,8 +220,8 @@ class Pressure:
 
 
 class WallLoads:
-    """The forces (n,) [N] of particles on the walls of the solid with number ``solid``. With `ALL_WALLS`, the forces
-    are on all walls."""
+    """The forces (n,) [N] of particles on the walls of the solid with number ``solid``. `ALL_WALLS` selects all
+    walls."""
 
     def __init__(self, solver: ParticleSolver):
         self._kernels, self.cell = wall_force_kernels(solver.discretisation), solver.lattice.cell

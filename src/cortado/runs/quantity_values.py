@@ -34,7 +34,7 @@ STRESS = "pressure"
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A state, and the parameters of the step after it. Quantities are computed on first use."""
+    """A state, and the parameters of the step after it. A moment computes quantities on first use."""
 
     state: State
     parameters: Mapping[str, NDArray]
@@ -60,8 +60,7 @@ class Moment:
         return cls(state, parameters, rollout.substeps, step, evaluator, set() if wanted is None else wanted)
 
     def value(self, name: str) -> NDArray:
-        """Return a quantity as a read-only float64 array. For a batch, the first axis of the result counts the
-        scenes."""
+        """Return a quantity as a read-only float64 array. A batch adds a first axis for the scenes."""
         if name not in self._values:
             self.wanted.add(name)
             names = filter(_needs_the_step, self.wanted) if _needs_the_step(name) else [name]
@@ -79,8 +78,8 @@ def _needs_the_step(name: str) -> bool:
 
 
 class QuantityEvaluator:
-    """Computes quantities in the arrays of a solver, so that no run may use the solver meanwhile. Results are in the
-    order of the scene. For a batch, the first axis of the result counts the scenes."""
+    """Computes quantities in the arrays of a solver, so that no run may use the solver meanwhile. Results have the
+    particles in the order of the scene. A batch adds a first axis for the scenes."""
 
     def __init__(self, solver: Solver, scene: Scene, circulation_factor: float):
         if not isinstance(solver, ParticleSolver):
@@ -185,9 +184,7 @@ class QuantityEvaluator:
                 check_quantity(name)
             elif name not in self._formulas:
                 solids = ", ".join(self.solver.system.solids) or "no solids"
-                raise InputError(
-                    f"{name!r} is a load on the solid {name.removesuffix(LOAD)!r}, but the scene has {solids}."
-                )
+                raise InputError(f"{name!r} is a load on {name.removesuffix(LOAD)!r}, but the scene has {solids}.")
         return wanted
 
     def _begin(self, names: Iterable[str], moment: Moment, replay: bool) -> tuple[StepContext, wp.array | None]:
@@ -214,9 +211,7 @@ class QuantityEvaluator:
         rollout.forward(keep=False)
         found = solver.pressures()
         if found is None:
-            raise InputError(
-                "The solver of this scene computes no pressure of particles, so that no pressure can be read."
-            )
+            raise InputError("The solver of this scene computes no pressure, so that no pressure can be read.")
         pressures = wp.clone(found)  # as a replay overwrites what was found
         self._counts = rollout.log.seek(0)
         rounds = rollout.diagnostics[solver.loops[0].iterations_name][0]
@@ -301,8 +296,7 @@ def add_to_row(rollout: Rollout, name: str, bar: NDArray, row: int, total: NDArr
 
 
 def _shares_of_rows(rollout: Rollout, name: str, row: int, values: NDArray) -> dict[int, float] | None:
-    """Return the weights of the time steps in the value of `row_of`, or None for a parameter that is constant in
-    time."""
+    """Return the weights of time steps in the value of `row_of`, or None for a parameter constant in time."""
     known = rollout.solver.layout.known
     if name not in known.over_time:
         return None

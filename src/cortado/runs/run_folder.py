@@ -34,7 +34,7 @@ FIGURES = (
     *(f"{name}.png" for name in (*_PLOTS, *NAMES, *_SHADED, *(f"measured_{k}" for k in range(100)))),
     *(f"{name}.mp4" for name in _FILMS),
 )
-"""Names of the figures that runs write. Other files belong to the user."""
+"""Names of the figures that runs write. All other files in the folder belong to the user."""
 TO_RESUME = "; choose another --out, or begin one without --resume"
 
 
@@ -106,7 +106,7 @@ class RunFolder:
         settings: Mapping[str, Any] | None = None,
         device: str = "",
     ) -> Self:
-        """Open the folder of a run, and record the new process in environment.json. Arguments are as in `create`."""
+        """Open the folder of a run, and record the process in environment.json. Arguments are as in `create`."""
         folder = cls.open(path, TO_RESUME)
         folder.require(scene_json, kind, settings)
         noted = read_json(folder.environment)
@@ -136,9 +136,7 @@ class RunFolder:
         """Raise `InputError` if a file of the scene, such as a mesh, is missing or has changed since the run began."""
         for name, mark in read_json(self.environment).get("files", {}).items():
             if not Path(name).is_file():
-                raise InputError(
-                    f"{name} is missing, but the run in {self.path} was made with this file: put the file back."
-                )
+                raise InputError(f"{name} is missing, but the run in {self.path} needs this file: put the file back.")
             if _mark(name) != mark:
                 found = f"{name} has changed since the run in {self.path} began"
                 raise InputError(f"{found}: restore the former file.")

@@ -208,9 +208,7 @@ class StepQuantities:
         solver, context = self._solver, self._solver.context(parameters)
         pressures = solver.pressures()
         if pressures is None:
-            raise InputError(
-                "The solver of this scene computes no pressure of particles, so that no pressure can be read."
-            )
+            raise InputError("The solver of this scene computes no pressure, so that no pressure can be read.")
         for name, formula in self._formulas.items():
             found = formula.value(context, pressures)
             if name not in self.kept:

@@ -104,7 +104,7 @@ class Trajectory:
     velocities: NDArray[Any]
     """Velocities of particles (frames, n, d) [m/s]."""
     diagnostics: Mapping[str, NDArray[Any]]
-    """Diagnostics of steps (steps,) by name, such as ``converged``. The names depend on the solver; see `StepLog`."""
+    """Diagnostics of steps (steps,) by name, such as ``converged``. Names depend on the solver; see `StepLog`."""
     mass_fractions: NDArray[Any] | None = None
     """Mass fractions (frames, n, phases) [-], or None for a single phase."""
     others: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class Trajectory:
     quantities: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Recorded quantities by name, such as ``density``, (frames, n) or (frames, n, k)."""
     sensors: Mapping[str, Readings] = field(default_factory=dict)
-    """Readings of sensors in every step, by sensor name. Trajectory files do not contain the readings."""
+    """Readings of sensors in every step, by sensor name. Trajectory files do not contain sensor readings."""
     solids: SolidMotions = field(default_factory=SolidMotions)
     """Motions of moving solids by name."""
     begun: int | None = None
@@ -189,8 +189,8 @@ class Trajectory:
 
     @property
     def due(self) -> NDArray[Any]:
-        """Return the times (frames,) [s] of the frames in films. The times are due times for a run with ``--fps``, and
-        ``times`` for any other run."""
+        """Return the times (frames,) [s] of the frames in films. With ``--fps`` the times are due times, otherwise
+        ``times``."""
         return self.times if self.marks is None else self.marks.due(self.times)
 
     @property
@@ -203,8 +203,8 @@ class Trajectory:
 
     @property
     def iterations(self) -> NDArray[Any]:
-        """Return the pressure iterations of each step (steps,) [-]. Raises `InputError` if the solver does not record
-        numbers of iterations."""
+        """Return the pressure iterations of each step (steps,) [-]. Raises `InputError` if a solver has no
+        iterations."""
         return noted(self.diagnostics, "iterations")
 
     @property
@@ -257,7 +257,8 @@ class Trajectory:
 
     def export(self, folder: str | PathLike[str], to: str, scene: Scene | str | PathLike[str] | None = None) -> Path:
         """Export the surface of the fluid, its particles and the solids to other programs; see `docs/into_blender.md`.
-        Colours are as in pictures. Return the path of the file to open, or the folder of a series of files.
+        Exported colours are the colours of pictures. Return the path of the file to open, or the folder of a series of
+        files.
 
         ``to`` is "usd" for one file with time samples, or "ply", "obj", "glb" or "vtp" for one file per frame. With
         "vtp", a file ``run.pvd`` for ParaView is added. ``scene`` is the scene or the path of its file. A trajectory
@@ -283,7 +284,8 @@ class Trajectory:
     def picture(
         self, k: int = -1, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> ShadedPicture:
-        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1. A notebook displays the picture.
+        """Draw a shaded picture of frame k, (rows, columns, 3), linear from 0 to 1. A notebook displays the returned
+        picture.
 
         The camera is placed so that the fluid is visible in every frame. The arguments ``scene``, ``device`` and
         ``settings``, and the errors, are as in `film`.
@@ -295,8 +297,8 @@ class Trajectory:
     def film(
         self, path: str | Path, *, scene: Scene | str | Path | None = None, device: str = "cpu", **settings: Any
     ) -> Film:
-        """Write a film of the run, and return the film. A notebook plays the film. After a stop by Ctrl-C, a second
-        call with the same arguments continues the film. See `docs/pictures.md`.
+        """Write a film of the run, and return the film. A notebook plays the returned film. After a stop by Ctrl-C, a
+        second call with the same arguments continues the film. See `docs/pictures.md`.
 
         Args:
             path: path that ends in .mp4, or in .webp for an animation on web pages. A .webp cannot be continued after a

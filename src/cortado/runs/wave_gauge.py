@@ -121,7 +121,7 @@ class Column:
     points: NDArray[Any]
     """Positions of points (levels, c, d) [m]."""
     weights: NDArray[Any]
-    """Weights of points (c,). The weights inside the container add up to 1."""
+    """Weights of points (c,). The weights of the points inside the container add up to 1."""
     outside: NDArray[Any]
     """Fraction of the cell around each point that is outside the container (c,)."""
     solids: list[tuple[Standing, NDArray[Any]]]
@@ -259,10 +259,10 @@ class WaveGauge(Summed):
 
     h = floor + sum_i V w_i,   w_i = w(r_i / radius) with the integral 1.
 
-    Here r_i is the horizontal distance of particle i, V = spacing^d its volume, and w a smooth function. Solids occupy
-    part of the column. The height is also correct above a solid on the floor, within the fluid or piercing its surface.
-    Fluid in the air, or on a solid with air below the solid, counts as if the fluid lay on the fluid below. The column
-    ends at sides of the container that are parallel to ``up``.
+    Here r_i is the horizontal distance of particle i, V = spacing^d its volume, and w a smooth function. In the column
+    of the gauge, solids occupy a part of the volume. The height is also correct above a solid on the floor, within the
+    fluid or piercing its surface. Fluid in the air, or on a solid with air below the solid, counts as if the fluid lay
+    on the fluid below. The column ends at sides of the container that are parallel to ``up``.
 
     Example::
 
@@ -285,8 +285,8 @@ class WaveGauge(Summed):
         whichever is larger.
 
         ``on`` names a solid that carries the bottom of the column. With ``axes`` "body" the column rotates with the
-        solid, and the height is measured along the axes of the solid. With "world" the height is measured along ``up``.
-        Sides of the container do not bound a column on a solid.
+        solid, and the height is measured along the axes of the solid. With ``axes`` "world", the height is measured
+        along ``up``. Sides of the container do not bound a column on a solid.
         """
         self.position, self.floor = point("position", position), float(floor)
         self.radius = None if radius is None else positive("radius", radius)

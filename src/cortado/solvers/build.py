@@ -89,9 +89,7 @@ def known_of(forces: Sequence[ForceMaker], solver: Any, scene: Scene) -> Known:
         if (place := getattr(maker, "replaces", None)) is not None and taken.setdefault(place, maker) is not maker:
             what = place.rpartition(".")[2].replace("_", " ")
             found = f"{shown(taken[place])} and {shown(maker)} both replace the scene's force of {what}"
-            raise InputError(
-                f"{found}, but only one force can: remove the other from forces or from the phase's rheology."
-            )
+            raise InputError(f"{found}, but only one can: remove one from forces or from the phase's rheology.")
     own = [(parameter, "a solver") for parameter in getattr(solver, "parameters", ())]
     own += [(parameter, "a force") for maker in forces for parameter in maker.parameters]
     own += [(parameter, "a solid") for parameter in motion_parameters(scene.solid)]
@@ -137,8 +135,9 @@ class SolverSetting:
 class SolverMaker(Protocol):
     """Protocol of a maker of a solver. A simulation and all simulations derived from it use the same maker.
 
-    The maker is pickled with the simulation. Kernels read the maker's optional ``parameters`` by name. An optional text
-    ``fingerprint`` identifies the maker. ``batches = True`` declares that the solver supports batches.
+    The maker is pickled with the simulation. Kernels may read the optional ``parameters`` of a maker by name. The
+    optional text ``fingerprint`` of a maker identifies the maker. ``batches = True`` declares that the solver supports
+    batches.
     """
 
     def build(self, setting: SolverSetting) -> Solver:

@@ -108,7 +108,7 @@ class LoopLimits:
     tolerance: float
     """Upper bound on the average or root mean square error."""
     greatest_tolerance: float
-    """Upper bound on the error of every particle. The bound may be infinite."""
+    """Upper bound on the error of every particle. The bound on the error of every particle may be infinite."""
 
 
 class StepRecord:
@@ -124,7 +124,7 @@ class StepRecord:
         self.read(0)
 
     def read(self, steps: int) -> None:
-        """Set the length of the last run to ``steps``. Recorded values are copied from the device when needed."""
+        """Set the length of the last run to ``steps``. The record copies its values from the device when needed."""
         self._steps = steps
         self._diagnostics: dict[str, NDArray] | None = None
 
@@ -144,8 +144,7 @@ class StepRecord:
         return self.copies[0].read(self._steps).max(axis=1)
 
     def bounds(self, limits: Mapping[str, float]) -> list[NDArray]:
-        """Return an upper bound for each array in ``copies``. Diagnostics that are not named in ``limits`` are
-        unbounded."""
+        """Return an upper bound for each array in ``copies``. Without a limit, the bound is infinite."""
         columns = [limits.get(name, np.inf) for name in self._columns] + [np.inf] * (2 - len(self._columns))
         return [np.array(limits.get(self._name, np.inf)), np.array(columns)][: len(self.copies)]
 

@@ -56,7 +56,7 @@ class Walled:
     """The region where particles may be, inside the container and outside the solids."""
 
     region: Region
-    """Region inside the container, unbounded along periodic axes. Without pressure the region is the whole space."""
+    """Region inside the container, unbounded along periodic axes. Without pressure, the region is the whole space."""
     near: Region
     spacing: float
     solids: tuple[Obstacle, ...]
@@ -74,7 +74,7 @@ class Walled:
         return min(DEEPEST * self.spacing, THINNEST * one.thickness)
 
     def furthest(self, precision: Precision) -> Region:
-        """Return the largest allowed box of particle positions. A low ``precision`` may limit the box."""
+        """Return the largest allowed box of particle positions. A low ``precision`` may limit the box of positions."""
         spilled, reach = np.isfinite(self.region.rim), FURTHEST * self.spacing
         limit = np.inf if spilled else precision.furthest * self.spacing
         return Region.between(np.maximum(self.near.lower - reach, -limit), np.minimum(self.near.upper + reach, limit))
@@ -86,7 +86,8 @@ def middle_of(one: Obstacle) -> Points:
 
 
 def obstacle_mesh(one: Obstacle, spacing: float, device: wp.Device) -> wp.Mesh:
-    """Make the surface mesh of an obstacle, with the obstacle's middle as origin. A 2-D shape becomes a tall prism."""
+    """Make the surface mesh of an obstacle, with the obstacle's middle as origin. A 2-D shape has the mesh of a tall
+    prism."""
     faces = one.solid.faces(FINE * spacing)
     faces = faces.reversed() if one.is_hollow else faces
     vertices, corners = faces.vertices - middle_of(one), faces.corners

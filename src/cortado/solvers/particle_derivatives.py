@@ -76,7 +76,7 @@ class ParticleAdjoint:
         shares = Shares(names, layout), SolidShares(solver.search.moving, layout)
         bodies = [own for part in self._parts if isinstance(part, FreeSolidsAdjoint) for own in part.bodies]
         self.bar = Adjoints(fields, solver.new_fractions(), solver.new_parameters(steps), *shares, bodies)
-        """Adjoints of a step. Call `collect` for the adjoints of parameters."""
+        """Adjoints of a step. Call `collect` to sum the adjoints of parameters."""
         self.carried_bar = Carried(solver.carried_fields, solver.layout)
         """Adjoints of the solver's state fields, after `unsort`."""
         self.density, self._acceleration_bar = solver.density.new_adjoint(), solver.vectors()

@@ -91,8 +91,7 @@ class ParticleSolver(Staying):
         if layout.phases == 1:
             self.fractions.fill_(1.0)
         self.accelerations = [self.vectors() for _ in range(len(self.forces) + 1)]
-        """Partial sums of accelerations. The array with index t is the sum of the accelerations by the first t
-        forces."""
+        """Partial sums of accelerations. Array t is the sum over the first t forces."""
         self.loops: tuple[Loop, ...] = ()
         self.step_number = wp.zeros(layout.members, dtype=wp.int32, device=device)
         self.containment = Containment(system.walled, layout, self.launch, system.waiting, search.moving)
@@ -113,8 +112,7 @@ class ParticleSolver(Staying):
         return None
 
     def kick_of(self, carried: Carried) -> wp.array | None:
-        """Return the velocity changes by the previous step's pressure from ``carried``, or None without stored
-        changes."""
+        """Return the velocity changes by the previous step's pressure in ``carried``, or None if not stored."""
         return None
 
     def vectors(self) -> wp.array:
@@ -246,8 +244,7 @@ class ParticleSolver(Staying):
 
     def densities(self, state: State, parameters: Parameters, step: int = 0) -> NDArray:
         """Return an array of shape (n,) with densities [kg / m3] in scene order, for a batch one scene after the other.
-        Moving solids are at their poses at the end of step ``step``. `densities` overwrites the arrays of the
-        solver."""
+        Moving solids are at their poses at the end of step ``step``. Arrays of the solver are overwritten."""
         self.reset(step)
         self.sort(state, parameters)
         while self.make_room():

@@ -18,8 +18,7 @@ from cortado.solvers.containment import Containment
 from cortado.sph.parts import StepContext
 
 Counts = tuple[int, ...]
-"""Numbers of iterations of each loop in a step. With the numbers of iterations, a solver can repeat the step
-exactly."""
+"""Numbers of iterations of each loop in a step. With these numbers, a step can be repeated exactly."""
 
 
 class StepLog(Protocol):
@@ -29,10 +28,10 @@ class StepLog(Protocol):
     def diagnostics(self) -> Mapping[str, NDArray]:
         """Return arrays (steps,) of diagnostics by name up to the last `read`; a batch has arrays (steps, batch).
 
-        Every solver has ``converged``. PCISPH also has ``iterations``, ``density_errors`` and
+        Every solver has ``converged``. The log of PCISPH also has ``iterations``, ``density_errors`` and
         ``greatest_density_errors``. The two errors are the mean and the maximum of the particles' relative compression.
-        The projection also has ``divergence``. Reports plot ``density_errors``, and treat integer diagnostics as
-        numbers of iterations.
+        The log of the projection also has ``divergence``. Reports plot ``density_errors``, and treat integer
+        diagnostics as numbers of iterations.
         """
 
     @property
@@ -40,8 +39,7 @@ class StepLog(Protocol):
         """Return the host copies of the log's arrays."""
 
     def is_calm(self, limits: Mapping[str, float]) -> bool:
-        """Return True if all loops converged in all steps up to the last `read`, and no diagnostic exceeds
-        ``limits``."""
+        """Return True if all loops converged in the steps of the last `read`, and no diagnostic exceeds ``limits``."""
 
     def read(self, steps: int) -> None:
         """Set ``steps`` as the number of steps in the last run. The diagnostics of the last run are read from the
@@ -114,7 +112,7 @@ class Solver(Protocol):
     step_number: wp.array
     """Array of shape (members,) with the number of each scene's next step."""
     generation: int
-    """Number of times that arrays or launches were replaced. A replacement makes captured CUDA graphs invalid."""
+    """Number of times that arrays or launches were replaced. After a replacement, captured CUDA graphs are invalid."""
 
     def new_state(self, requires_grad: bool = False) -> State:
         """Make a state of the solver's particles with the value 0 everywhere."""

@@ -156,8 +156,8 @@ class WallAction(Protocol):
         """Return an array (n,) of one vector for each sorted particle. A force's vectors are accelerations [m/s2]."""
 
     def tangent(self, step: StepContext, dot: Tangents, solid: int) -> wp.array:
-        """Return an array of shape (n,) with the tangents of the action of walls. Forward mode of the step must be
-        complete."""
+        """Return an array of shape (n,) with the tangents of the action of walls. Complete forward mode of the step
+        first."""
 
     def adjoint(self, step: StepContext, bar: Adjoints, solid: int, total_bar: wp.array, v_star_bar: wp.array) -> None:
         """Convert the adjoint ``total_bar`` of the action to adjoints of sorted particles, parameters and solids in

@@ -240,8 +240,7 @@ class Drains(Part):
         counts = (StateField(count_name(one.name), "", Entry.DOUBLE, Axis.SCALAR) for one in of.mouths)
         self.fields = (DRAINED, *map(behind, of.pulls), *counts)
         self.taken = layout.arrays(taken=real, fresh=real, waits=real)
-        """Arrays of shape (n,): the number of a particle's drain, 1 if the last drain removed the particle, and 1 if
-        the particle waits in an emitter."""
+        """Arrays of shape (n,): a particle's drain, 1 if removed by the last drain, and 1 if waiting in an emitter."""
         self.places = to_device(of.places, precision, device)
         self._nozzles = [(one, one.constants(layout)) for one in of.nozzles]
         self._never = layout.arrays(serial=wp.float64)["serial"]

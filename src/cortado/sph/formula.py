@@ -238,8 +238,7 @@ class Formula:
     """Part of the names of Warp modules for a law of viscosity; empty for Newtonian fluids."""
 
     def of_phases(self, what: str, phases: int) -> "Formula":
-        """Return the formula for the given number of phases. Raise `InputError` if the function needs another number of
-        phases."""
+        """Return the formula for the given number of phases. Raise `InputError` for an unsuitable number."""
         if FRACTIONS not in self.fields:
             return self
         if phases == 1:
@@ -299,7 +298,7 @@ def _shapes(what: str, function: FunctionType, values: Mapping[str, Any], inputs
             continue
         if not inputs.arrays:
             raise InputError(
-                f"{what} has the array {name}, but must have only numbers and vectors: only Body takes arrays."
+                f"{what} has the array {name}, but may have only numbers and vectors: use Body for arrays."
             )
         if not (1 <= len(shape) <= MOST_AXES and 0 < prod(shape) <= MOST_NUMBERS):
             wanted = f"one to {MOST_AXES} axes, and 1 to {MOST_NUMBERS} numbers"

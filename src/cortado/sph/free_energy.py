@@ -35,15 +35,14 @@ FLOOR = 1e-3
 @public
 @dataclass(frozen=True)
 class FreeEnergy:
-    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define other free
-    energies."""
+    """A free energy as a function of mass fractions (phases,), for kernels and for NumPy. Users may define others."""
 
     name: str
     value: Callable[[np.ndarray], np.ndarray]
     """Function from mass fractions (n, phases) to free energies (n,)."""
     curvature: float
     """Greatest eigenvalue of the Hessian of the free energy, for mass fractions from 0 to 1 with a constant sum. The
-    eigenvalue bounds the time step."""
+    eigenvalue limits the time step of diffusion."""
     functions: Callable[[Precision, int], Any]
     """Function from a precision and a number of phases to an object with two Warp functions. ``gradient`` is the
     gradient of the free energy, and ``hessian_product`` is the product of the Hessian and a vector."""
@@ -229,7 +228,7 @@ def stable_substeps(
     scene: Scene, energy: FreeEnergy, time_step: float, mobility: float, width: float, densities: np.ndarray
 ) -> int:
     """Return the number of diffusion substeps that makes a ``time_step`` [s] stable. ``mobility`` is in m2/s, the
-    interface ``width`` in m, and the rest ``densities`` (phases,) in kg/m3. A substep lasts at most
+    interface ``width`` in m, and the rest ``densities`` (phases,) in kg/m3. A substep of diffusion lasts at most
 
         dt = safety 2 / (M l (eps^2 l + max f'')),   l the greatest eigenvalue of the Laplacian on the lattice,
 

@@ -154,16 +154,15 @@ class Push(Protocol):
 
     @property
     def derivatives(self) -> tuple[type, type]:
-        """Classes of tangent and adjoint. The classes have methods ``look``, which add to `Changes.given`, or read the
-        adjoints of `Changes.given`."""
+        """Classes of tangent and adjoint, with methods ``look`` that add to `Changes.given` or read its adjoints."""
 
     def look(self, step: StepContext) -> None:
         """Add the momenta by this force to `FreeBody.given` of the rigid bodies."""
 
 
 def given_to(each: "Sequence[FreeBody | Changes]", body: int, other: int) -> dict[str, wp.array]:
-    """Return the momenta of two rigid bodies by kernel argument name. For an ``other`` of -1, the momenta of the first
-    body are returned twice."""
+    """Return the momenta of two rigid bodies by kernel argument name. An ``other`` of -1 returns the first momenta
+    twice."""
     others = each[body if other < 0 else other].given
     return {**each[body].given, **{name.replace("ed", "ed_other", 1): array for name, array in others.items()}}
 
@@ -175,8 +174,8 @@ class Motions:
         vectors = {"shape": layout.members, "dtype": layout.precision.vector, "device": layout.device}
         self.before, self.moved = ({f"{name}{suffix}": wp.zeros(**vectors) for name in MOTION} for _ in range(2))
         self.given, self.pressed = ({f"{name}{suffix}": wp.zeros(**vectors) for name in GIVEN} for _ in range(2))
-        """``given`` has the momenta by contacts, springs and friction. ``pressed`` has the momenta by pressures of the
-        previous step."""
+        """``given`` has momenta by contacts, springs and friction, ``pressed`` momenta by the previous step's
+        pressures."""
 
 
 class FreeBody(Motions):

@@ -272,7 +272,7 @@ def check_calls(what: str, function: ast.FunctionDef, own: set[str], scope: Mapp
 
 
 def check_truths(what: str, function: ast.FunctionDef) -> None:
-    """Raise `InputError` for ``and`` and ``or`` used as numbers. Python and Warp return different values."""
+    """Raise `InputError` for ``and`` and ``or`` used as numbers. Warp returns other values than Python."""
     tests: set[ast.AST] = set()
     for node in ast.walk(function):
         if isinstance(node, (ast.If, ast.IfExp, ast.While, ast.Assert)):

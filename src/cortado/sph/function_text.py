@@ -38,7 +38,7 @@ def plain_function(kind: str, function: Any) -> FunctionType:
     check_bare(f"{kind} function {plain.__name__}", plain)
     if plain.__code__.co_flags & (inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ASYNC_GENERATOR):
         raise InputError(
-            f"{kind} function {plain.__name__} is a coroutine or a generator, but must be a function that returns."
+            f"{kind} function {plain.__name__} is a coroutine or a generator, but must be a plain function."
         )
     return plain
 
@@ -257,8 +257,8 @@ def code_words(value: Any) -> str:
 
 
 def words(value: Any, names: tuple[str, ...] | None = None, seen: set[Any] | None = None) -> list[str]:
-    """Return lines of text that identify what a value computes. The lines are equal in every process. For objects and
-    for a user's modules, only the attributes ``names`` are included."""
+    """Return lines of text that identify what a value computes. The lines for a value are equal in every process. For
+    objects and for a user's modules, only the attributes ``names`` are included."""
     value, seen = _parts(value), set() if seen is None else seen
     if isinstance(value, (bool, int, float, complex, str, bytes, range, slice, type(None))):
         return [repr(value)]

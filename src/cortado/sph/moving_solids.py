@@ -100,7 +100,7 @@ def hold_functions(precision: Precision) -> SimpleNamespace:
 
 
 def free_module(precision: Precision, topic: str = "bodies") -> Any:
-    """Kernels that only some bodies need have their own ``topic``: Warp compiles a changed module again."""
+    """Kernels that only some bodies need have their own ``topic``, so that Warp compiles no other kernels again."""
     return kernel_module(f"free_{topic}_derivative_{precision.name}")
 
 
@@ -165,7 +165,7 @@ def rotations(precision: Precision, dimension: int) -> SimpleNamespace:
 
     @wp.func_grad(rotation)
     def rotation_adjoint(turn: vector, adj_ret: matrix):
-        """Apply the transposed Jacobian of a rotation. Warp's generated adjoint would be 0 at angle 0."""
+        """Apply the transposed Jacobian of a rotation. Warp's generated adjoint of a rotation would be 0 at angle 0."""
         wp.adjoint[turn] += further(-turn, turning(rotation(turn), adj_ret))
 
     angle, found = (real, about_z) if dimension == 2 else (vector, rotation)

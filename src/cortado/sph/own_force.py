@@ -40,7 +40,7 @@ from cortado.sph.viscous_stress import ViscousStress, stress_of
 class OverTime:
     """A parameter of a force that changes in time: linear between the given times, and constant before and after them.
 
-    A time step uses the value at the middle of the step. A search may use one value for each step.
+    A time step uses the value at the middle of the step. A search may use one value of the parameter for each step.
 
     Example: ``k = cortado.forces.OverTime([0.0, 0.5], [2.0, 8.0])``
     """
@@ -249,8 +249,8 @@ class Body(OwnForce):
     position [m], its velocity [m/s] and the time [s].
 
     The argument ``t`` may be left out. Arguments with the following names are quantities of the particle: ``density``
-    [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]. All other arguments are
-    parameters.
+    [kg/m3], ``mass_fractions`` [-], ``shear_rate`` [1/s], ``velocity_gradient`` [1/s]. Arguments with other names are
+    parameters of the function.
 
     Example::
 
@@ -291,9 +291,9 @@ class Pair(OwnForce):
     """A force between neighbours. ``function(x_ij, v_ij, t, ...)`` returns the force [N], in 2-D per metre of depth, of
     a neighbour on a particle.
 
-    ``x_ij`` [m] and ``v_ij`` [m/s] are the particle's position and velocity relative to the neighbour. The time ``t``
-    may be left out. The force is multiplied by a weight that falls from 1 at distance 0 to 0 at the support radius. A
-    force f conserves momentum if f(-x, -v) = -f(x, v). Walls exert no user-defined pair force.
+    ``x_ij`` [m] and ``v_ij`` [m/s] are the particle's position and velocity relative to the neighbour. The function may
+    leave out the time ``t``. The force is multiplied by a weight that falls from 1 at distance 0 to 0 at the support
+    radius. A force f conserves momentum if f(-x, -v) = -f(x, v). Walls exert no user-defined pair force.
 
     Example::
 

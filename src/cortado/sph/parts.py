@@ -75,7 +75,7 @@ class StepContext:
 
     def aside(self) -> AbstractContextManager[None]:
         """Let the launches inside this context manager run concurrently with later launches, until `join` is called.
-        The launches must not depend on each other."""
+        The launches inside the context manager must not depend on each other."""
         return self.launcher.aside()
 
     def join(self) -> None:
@@ -134,7 +134,8 @@ class Adjoints:
     @cached_property
     def named(self) -> tuple[Named, ...]:
         """Return the adjoints by kernel argument name, such as ``x_bar``. Adjoints of parameters over time are sums
-        (members, steps). Adjoints of parameters in ``shares`` are terms of particles (n,), which are summed later."""
+        (members, steps) over particles. Adjoints of parameters in ``shares`` are terms of particles (n,), which are
+        summed later."""
         over_time = [name for name in self.parameters.names if self.shares.known[name].axis is Axis.STEP]
         whole = {f"{argument(name)}_bar": self.parameters[name] for name in over_time}
         return self.fields.named("_bar"), {"fractions_bar": self.fractions}, self.shares.named("_bar"), whole
@@ -163,8 +164,7 @@ class Force(Protocol):
     Adjoints of parameters over time are sums (members, steps) instead."""
 
     def accelerate(self, step: StepContext, before: wp.array, after: wp.array) -> None:
-        """Write the sum of ``before`` and the force's acceleration to ``after``. ``before`` and ``after`` contain (n,)
-        vectors."""
+        """Write the sum of ``before`` and the force's acceleration to ``after``. The arrays have (n,) vectors."""
 
     def tangent(self, step: StepContext, dot: Tangents, before: wp.array, after: wp.array) -> None:
         """Write the sum of ``before`` and the tangent of the force's acceleration to ``after``, (n,) vectors."""
@@ -260,7 +260,7 @@ class Part:
 
 class PartMaker(Protocol):
     def part(self, layout: Layout, requires_grad: bool) -> Part:
-        """Make the part for a solver. With ``requires_grad``, its arrays have gradients for ``warp.Tape``."""
+        """Make the part for a solver. With ``requires_grad``, the part's arrays have gradients for ``warp.Tape``."""
 
 
 class Carried:
@@ -285,9 +285,7 @@ class Carried:
 
     def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
         if values.keys() != set(self._arrays.names):
-            raise TypeError(
-                f"the step sorts {', '.join(self._arrays.names)}, but was given values of {', '.join(values)}."
-            )
+            raise TypeError(f"the step sorts {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
         for name, a in values.items():
             unsort(step, a, state[name])
 
@@ -325,7 +323,7 @@ def order_kernels(dtype: Any, module: Any) -> SimpleNamespace:
 
 
 def integration_module(precision: Precision, forward: bool, taped: bool = False, topic: str = "integration") -> Any:
-    """Kernels that only few scenes use have their own ``topic``: Warp compiles a changed module again."""
+    """Kernels that only few scenes use have their own ``topic``, so that Warp compiles no other kernels again."""
     return kernel_module(f"{topic}_{kind_of(forward, taped)}_{precision.name}", forward and taped)
 
 

@@ -14,7 +14,8 @@ A spring and a motor at a hinge give a body, turned by the angle phi about the h
     T - k (phi - phi_0) - C (r - s),
 
 with the motor's torque T, the stiffness k, the rest angle phi_0, the damping C, the angular velocity r about the hinge,
-and the motor's speed s. The second solid gets the opposite torque. At half a turn, the angle phi jumps from pi to -pi.
+and the motor's speed s. The hinge gives the second solid the opposite torque. At half a turn, the angle phi jumps from
+pi to -pi.
 """
 
 from collections.abc import Iterator, Sequence

@@ -145,8 +145,8 @@ class Pcisph(ParticleSolver):
         y = self.numbers() if self.layout.phases > 1 else wall_y
         self.known: dict[str, Any] = {"wall_y": wall_y, "t": t, "y": y, "stiffness": self.lattice.stiffness}
         self.iterates = SimpleNamespace(x_star=[], v_star=[], p=[self.numbers()], c=[])
-        """Predicted states and pressures of the iterations of a step. Without derivatives, only the latest iteration is
-        stored. ``p`` has the pressures before each iteration, which are 0 before the first iteration."""
+        """Predicted states and pressures of the iterations of a step. Without derivatives, the solver stores only the
+        latest iteration. ``p`` has the pressures before each iteration, which are 0 before the first iteration."""
         Pcisph.reserve(self, (1,))
         self.pressure_loop = Loop(limits, self.layout, self.launch)
         self.loops = (self.pressure_loop,)

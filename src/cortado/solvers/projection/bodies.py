@@ -193,8 +193,7 @@ class Bodies:
         return [{**held.moved, **held.faster} for held in self.held]
 
     def at_rest(self) -> "Bodies":
-        """Return a copy for bodies at rest without hinges. With the copy, the result of `drifted` is linear in the
-        pressures."""
+        """Return a copy for bodies at rest without hinges. The copy has a `drifted` that is linear in the pressures."""
         other = copy(self)
         other.joints = Joints(self.part, (), self.layout)
         other.held, other.drift = [held.at_rest() for held in self.held], wp.zeros_like(self.drift)

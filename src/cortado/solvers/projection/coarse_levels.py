@@ -139,7 +139,7 @@ def level_kernels(precision: Precision, dimension: int) -> SimpleNamespace:
 
 
 def pairs_of_corners(dimension: int) -> int:
-    """Return the number of pairs of corners of a cell. A corner also forms a pair with itself."""
+    """Return the number of pairs of corners of a cell, where a corner also forms a pair with itself."""
     return 2**dimension * (2**dimension + 1) // 2
 
 

@@ -207,7 +207,7 @@ SOLVE = """
         if (lead) system.count.data[member] = done;
     }
 """
-"""C++ code of a solve. Nodes without matrix entries get the result 0."""
+"""C++ code of a solve. The solve sets the result of nodes without matrix entries to 0."""
 
 
 @cache

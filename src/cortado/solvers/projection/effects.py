@@ -135,7 +135,7 @@ def effect_functions(precision: Precision, dimension: int, module: Any) -> Simpl
 EVEN = (0.7, 0.9)
 """The weight of images grows from 0 to 1 between the two ratios of image density to wall density."""
 LEAST = 1e-6
-"""Smallest wall coverage that counts."""
+"""Smallest wall coverage that is not treated as 0."""
 
 
 @cache

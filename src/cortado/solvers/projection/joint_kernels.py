@@ -86,8 +86,7 @@ def joint_kernels(precision: Precision) -> SimpleNamespace:
 
     @wp.func
     def gone(R: matrix, P: vector, W: vector, volume: real, hold: held) -> vector:
-        """Return the change of a body's velocity by a momentum ``P``. ``W`` is the change of the body's angular
-        velocity."""
+        """Return the change of a body's velocity by a momentum ``P``. ``W`` is the change of angular velocity."""
         return wp.cw_mul(hold.moving, P) / volume - wp.cross(W, R * hold.arm)
 
     @wp.func

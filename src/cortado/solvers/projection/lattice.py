@@ -57,7 +57,7 @@ def endless(discrete: DiscreteScene) -> bool:
 
 def coarse_grid(scene: Scene, discrete: DiscreteScene, particles: int) -> Grid:
     """The number of nodes along each axis is 4 to 7 times a power of two, so that coarser levels can halve the number.
-    Nodes lie on the lower walls of a container."""
+    In a container, nodes lie on the lower walls."""
     reach, most = SPACING * scene.discretisation.spacing, max(4 * particles, 512)
     grid = Grid.around(discrete.near.lower, discrete.near.upper, discrete.periods, reach, most)
     cell, shape = grid.cell.copy(), [*grid.shape]

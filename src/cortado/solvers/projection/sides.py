@@ -67,8 +67,8 @@ def side_kernels(precision: Precision) -> Kernels:
 
     @wp.func
     def time_of(start: vector, y: vector, face: int, least: real, sheets: sheets_of) -> real:
-        """Return the fraction of the path before the face. Return 1 if the path ends too close to the face without
-        crossing it, and 2 if the path does not meet the face."""
+        """Return the fraction of the path before the face. Return 1 if the path of a particle ends too close to a face
+        without crossing the face, and 2 if the path does not meet the face."""
         n, a = sheets.faces.normals[face], sheets.faces.places[face, 0]
         side = side_of(start, face, sheets)
         h_0, h = side * wp.dot(n, start - a), side * wp.dot(n, y - a)
@@ -208,8 +208,7 @@ class Sides:
         self._none = layout.arrays("_bar", **share_kinds(layout.precision))
 
     def keep(self, step: StepContext, x_now: wp.array) -> wp.array:
-        """Return an array (n,) of sorted particles' corrected positions. ``x_now`` are the positions before particles
-        are put back."""
+        """Return an array (n,) of sorted particles' corrected positions. ``x_now`` are the uncorrected positions."""
         for k, x_kept in zip(self._passes, self._kept, strict=True):
             step.launch(self._kernels.forward, self._known, k=k, x_now=x_now, x_kept=x_kept)
             x_now = x_kept

@@ -116,7 +116,7 @@ IMPULSE = "pressure_impulse"
 KICK = "pressure_kick"
 """Name of the state field for the velocity change by pressures."""
 MOMENTUM = 8.0 / (1.0 + 101.0**0.5)
-"""Momentum of the first pressure iteration (Nesterov 1983). Later iterations have no momentum."""
+"""Momentum of the first pressure iteration (Nesterov 1983). Later pressure iterations have no momentum."""
 
 
 class ProjectionSteps(ParticleSolver):
@@ -148,8 +148,7 @@ class ProjectionSteps(ParticleSolver):
         self._iterate_kinds = {"u": vector, "A": precision.matrix, "d": real, "y": real, "k": real}
         self._repair_kinds = {"x_now": vector, "c": real, "excess": real, "held": real}
         self.iterates: list[dict[str, wp.array]] = []
-        """Values before each pressure iteration. The last element of the list has the values at the end of the
-        iterations."""
+        """Values before each pressure iteration. The last element has the result."""
         self.corrected: list[dict[str, wp.array]] = []
         """Velocities and pressures after each coarse correction."""
         self.repaired: list[dict[str, wp.array]] = []
@@ -273,7 +272,7 @@ class ProjectionSteps(ParticleSolver):
         return MOMENTUM if k == 0 else 0.0
 
     def _drift(self, context: StepContext, at: dict[str, wp.array]) -> wp.array:
-        """Return the divergence due to moving walls. Free bodies move under the pressures of the iteration."""
+        """Return the divergence due to moving walls. The pressures of the iteration move the walls of free bodies."""
         drift = self.density.around["drift"]
         return drift if self.bodies is None else self.bodies.drifted(context, drift, at["y"])
 

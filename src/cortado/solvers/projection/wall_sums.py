@@ -306,7 +306,7 @@ class FaceShares:
         self._nothing = system.layout.arrays(**kinds) if self._faces else {}
 
     def add(self, context: StepContext, bar: Adjoints, *groups: Named, over: int = ALL_WALLS, **arrays: Any) -> None:
-        """Add the terms of images in all walls or in the solid ``over``. Missing ``arrays`` count as 0."""
+        """Add the terms of images in all walls or in the solid ``over``. Missing ``arrays`` of adjoints count as 0."""
         if self._faces:
             known = {**self._nothing, **{name: array for group in groups for name, array in group.items()}, **arrays}
             bar.solids.add(context.launch, self._kernel, *bar.named, known, over=over)
