@@ -106,7 +106,7 @@ def test_an_interruption_while_a_thread_waits_leaves_nothing_taken():
 def test_a_forked_process_has_no_gpu():
     turn = Turn(SimpleNamespace(is_cpu=False))
     turn.forked()
-    with pytest.raises(ComputationError, match="forked from the one that made it"):
+    with pytest.raises(ComputationError, match="forked from the simulation's process"):
         turn.__enter__()
 
 

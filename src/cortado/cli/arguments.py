@@ -95,7 +95,7 @@ class FrameOptions:
 
     def check(self) -> None:
         if self.fps is not None and self.record_every is not None:
-            raise InputError("--fps is given, but must be left out, as --record-every says which states are recorded.")
+            raise InputError("--fps is given, but must be left out, as --record-every selects the recorded states.")
         require_at_least(1, 1 if self.record_every is None else self.record_every, "--record-every")
 
     def choice(self, otherwise: int = 1) -> "FrameChoice":

@@ -90,7 +90,7 @@ def _metrics(one: RunFolder, other: RunFolder, settings: list[dict[str, Any]], s
 
 
 def _last_states(one: RunFolder, other: RunFolder) -> dict[str, Any] | None:
-    """Compare the fields of two runs at the latest time of which both have a frame."""
+    """Compare the fields of two runs at the latest time at which both runs have a frame."""
     if not (one.trajectory.exists() and other.trajectory.exists()):
         return None
     runs = [Trajectory.load(folder.trajectory) for folder in (one, other)]
@@ -184,7 +184,7 @@ class Resolved:
     def __init__(self, folder: RunFolder, quantities: Sequence[OwnQuantity]):
         result = folder.read_result()
         if result is None or result["failures"] or "energy" not in result or not folder.trajectory.exists():
-            raise InputError(f"{folder.path} is no run that has ended well, but each RUN must be one.")
+            raise InputError(f"{folder.path} is not the folder of a completed run, but each RUN must be one.")
         trajectory = Trajectory.load(folder.trajectory)
         last, self.path, self.scene = trajectory[-1:], folder.path, read_json(folder.scene)
         self.precision = read_json(folder.environment).get("settings", {}).get("precision", "")
@@ -211,7 +211,7 @@ class Resolved:
         table, name = key.split(".")
         value = self.scene[table][name]
         if not isinstance(value, float | int):
-            raise InputError(f"{self.path} chooses its {name}, but must have a fixed one.")
+            raise InputError(f"The solver of {self.path} chooses the {name}, but the {name} must be fixed.")
         return float(value)
 
 
@@ -219,13 +219,13 @@ def convergence_table(folders: Sequence[Path], quantities: Sequence[str], as_jso
     own = [OwnQuantity(one) for one in quantities]
     runs = [Resolved(folder, own) for folder in named_runs(folders)]
     if len(runs) < LEAST_RUNS:
-        raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST_RUNS}.")
+        raise InputError(f"RUN names {len(runs)} runs, but an order of convergence takes at least {LEAST_RUNS} runs.")
     key = _varied(runs)
     runs.sort(key=lambda run: -run.size(key))
     sizes = [run.size(key) for run in runs]
     for coarse, fine in pairwise(runs):
         if coarse.size(key) == fine.size(key):
-            raise InputError(f"{coarse.path} and {fine.path} have the same {key}, but each run must have another.")
+            raise InputError(f"{coarse.path} and {fine.path} have the same {key}, but must differ.")
         if abs(coarse.end - fine.end) > SAME_TIME * abs(fine.end):
             found = f"{coarse.path} ends at {coarse.end:g} s and {fine.path} at {fine.end:g} s"
             advice = "choose a --time that is a multiple of every time step"
@@ -254,7 +254,7 @@ def _varied(runs: Sequence[Resolved]) -> str:
         if run.precision != runs[0].precision:
             raise InputError(f"{run.path} is in {run.precision}, but must be in {runs[0].precision} as {runs[0].path}.")
     if more := sorted(changed - SIZE_UNITS.keys()):
-        raise InputError(f"The runs differ in {', '.join(more)}, but must only differ in {SPACING} and {TIME_STEP}.")
+        raise InputError(f"The runs differ in {', '.join(more)}, but may differ only in {SPACING} and {TIME_STEP}.")
     if not changed:
         raise InputError(f"The runs do not differ, but must differ in {SPACING} or {TIME_STEP}.")
     return SPACING if SPACING in changed else TIME_STEP
@@ -284,8 +284,8 @@ class Extrapolation:
 
     Source: L. F. Richardson, Phil. Trans. R. Soc. A 210 (1911), 307; the grid convergence index of P. J. Roache, J.
     Fluids Eng. 116 (1994), 405; for sizes with different ratios, I. B. Celik et al., J. Fluids Eng. 130 (2008), 078001.
-    Without an observed order, the error is three times the greatest difference between the three results: L. Eca and M.
-    Hoekstra, J. Comput. Phys. 262 (2014), 104."""
+    Without an observed order, the error is three times the greatest difference between the results at the three sizes:
+    L. Eca and M. Hoekstra, J. Comput. Phys. 262 (2014), 104."""
 
     order: float | None
     """Observed order of convergence, or None if the values do not converge."""

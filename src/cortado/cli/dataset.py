@@ -138,7 +138,7 @@ def _table(file: Path, overrides: list[str]) -> datasets.DatasetTable:
     data = read_toml(file, overrides, ("problem", "optimise", "fit"))
     if "dataset" not in data:
         raise errors.SceneError(
-            str(file), "dataset", MISSING, "a table that says what varies, as docs/datasets.md has one"
+            str(file), "dataset", MISSING, "a table of the varied values, like the example in docs/datasets.md"
         )
     try:
         with in_sentences(datasets.DatasetTables):
@@ -148,7 +148,7 @@ def _table(file: Path, overrides: list[str]) -> datasets.DatasetTable:
 
 
 def _asked(member: Member) -> dict[str, Any]:
-    """To find mistakes early, the scene is read with the least and with the greatest varied values."""
+    """The scene is read once with the least and once with the greatest varied values, to find mistakes early."""
     table = member.table
     with errors.unwarned():
         ends = [[f"{key}={json.dumps(pair[end])}" for key, pair in table.vary.items()] for end in (0, 1)]

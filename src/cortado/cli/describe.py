@@ -70,9 +70,9 @@ class RunLength:
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
         self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
-        """Number of steps. It is an estimate if the solver chooses the time steps of a run until a given time."""
+        """Number of steps. An estimate if the solver chooses the time steps of a run until a given time."""
         self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
-        """Simulated time [s]. None if the number of steps is given and the solver chooses the time steps."""
+        """Simulated time [s]. None for a given number of steps whose lengths the solver chooses."""
         self.frames = frames = choice.count(self.steps, time)
         """Number of recorded frames, including the first and last state, or None if it is unknown."""
         self.trajectory: float | None = None

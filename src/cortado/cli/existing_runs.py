@@ -135,7 +135,7 @@ def draw_runs(
         return f"The film is in {path}: {made.in_words}."
     if frame not in range(-len(times), len(times)):
         of = "the run has" if len(each) == 1 else "together the runs have"
-        raise InputError(f"--frame is {frame}, but {of} {len(times)} frames, from 0.")
+        raise InputError(f"--frame is {frame}, but {of} {len(times)} frames, numbered from 0.")
     path = out or place / f"{name}.png"
     write_picture(path, page.image(frame % len(times)))
     if path.parent == folders[0].figures:

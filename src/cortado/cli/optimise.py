@@ -53,7 +53,7 @@ def judge(
     task: Task, result: Result, estimate: Arrays | None = None, noise: float | None = None, first: float | None = None
 ) -> Verdict:
     """``estimate`` has the found parameters, if ``result`` does not have them. ``noise`` is the peak signal-to-noise
-    ratio of the last image [dB]. ``first`` is the initial loss, if the history does not start with it."""
+    ratio of the last image [dB]. ``first`` is the initial loss, for a history that starts later."""
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf

@@ -31,8 +31,8 @@ from cortado.simulation import Simulation
 from cortado.watching import Watch
 
 OFTEN, SHARE = 5.0, 20.0
-"""Least time between two writes of sensor readings and diagnostics [s], and its least ratio to the duration of a
-write."""
+"""Least time between two writes of sensor readings and diagnostics [s], and least ratio of this time to a write's
+duration."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def run_scene(scene_file: Path, asked: RunRequest) -> str:
         file = RunFolder.open(path, ", but --state must be the folder of one").trajectory if path.is_dir() else path
         earlier = Trajectory.load(file)
         if not len(earlier):
-            raise InputError(f"{file} holds no frame, but --state must be a trajectory to go on from.")
+            raise InputError(f"{file} holds no frame, but --state must have a frame from which the run continues.")
         state = earlier.last_state
     scene = load_scene(scene_file, asked.overrides)
     scene = scene.lasting(asked.time, asked.steps) if state is None else scene.going_on(state)

@@ -269,7 +269,7 @@ class Balance:
 
     @classmethod
     def of(cls, scene: Scene, first: Mapping[str, Any], last: Mapping[str, Any]) -> Self:
-        """Count the particles, given `Frame.others` of the first and the last frame."""
+        """Count the particles from `Frame.others` of the first and the last frame."""
         counts = {drain.name: count_name(drain.name) for drain in scene.drain}
         went = {name: int(np.ravel(last[key])[0] - np.ravel(first[key])[0]) for name, key in counts.items()}
         states = ((np.ravel(at["drained"]), at) for at in (first, last))

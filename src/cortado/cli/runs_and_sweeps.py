@@ -136,9 +136,9 @@ def picture(
     if film and frame is not None:
         raise InputError("--frame is given, but must be left out, as --film has all frames.")
     if lines is not None:
-        _refuse(words, ("width", "height"), "--lines says so already")
+        _refuse(words, ("width", "height"), "--lines already sets the size of the picture")
     if colour is not None:
-        _refuse(words, ("colour",), "--colour says so already")
+        _refuse(words, ("colour",), "--colour already sets the colour")
     if not film:
         _refuse(words, ("film_frames", "film_speed"), "one picture is drawn: add --film")
     from cortado.cli.existing_runs import camera_override, draw_runs

@@ -51,7 +51,7 @@ class Combination:
 
 
 def combinations(options: Sequence[str], zipped: Sequence[str] = ()) -> list[Combination]:
-    """Return all combinations of the values of all keys. The first values of all ``zipped`` keys belong together, then
+    """Return all combinations of the values of all keys. The first values of all ``zipped`` keys occur together, as do
     the second values, and so on. Raises `InputError` for wrong options."""
     if not options and not zipped:
         raise InputError("--set is missing, but must name what changes, such as --set solver.time_step=0.001,0.002.")
@@ -144,7 +144,7 @@ class Member:
         return found
 
     def finished(self, combination: Combination) -> dict[str, Any] | None:
-        """Return the result of a combination, or None if its run has not ended."""
+        """Return the result of a combination of values, or None if the run of this combination has not ended."""
         overrides = combination.overrides
         if self.duration is None:
             task = load_task(self.file, overrides)

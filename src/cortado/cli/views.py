@@ -303,7 +303,7 @@ class LiveView:
 
     def _controls(self) -> dict[str, np.ndarray]:
         """Return the parameters of the next steps: gravity, and the path of each nozzle. A nozzle moves in a straight
-        line to the position of its sliders."""
+        line to the position that the sliders show."""
         controls = {"gravity": np.array([slider.value for slider in self.gravity])}
         share = np.arange(1, self.steps + 1)[:, None] / self.steps
         for name, sliders in self.nozzles.items():

@@ -1,7 +1,7 @@
 """A counting sort of particles by the cells of a grid, for each scene of a batch.
 
 The grid wraps around in every direction, so that every position has a cell. Along a periodic axis the cells divide the
-period. Along other axes distant particles may share a cell, and a distance test rejects them.
+period. Along an axis without a period, distant particles may share a cell. A distance test rejects distant particles.
 """
 
 from functools import cache, partial
@@ -28,7 +28,7 @@ def cell_grid_type(precision: Precision) -> Any:
 
 @cache
 def cell_functions(precision: Precision) -> SimpleNamespace:
-    """``below`` and ``above`` give the range of neighbouring cells along an axis with n cells."""
+    """``below`` and ``above`` return the range of offsets of neighbouring cells along an axis with n cells."""
     vector = precision.vector
     grid_type = cell_grid_type(precision)
 

@@ -14,7 +14,7 @@ class Grid:
     cell: np.ndarray
     """Edge lengths of a cell [m], (3,)."""
     shape: tuple[int, int, int]
-    """Number of cells along each axis, which is 1 along z in 2-D."""
+    """Number of cells along each axis. In 2-D, the number along z is 1."""
 
     @property
     def cells(self) -> int:
@@ -22,7 +22,7 @@ class Grid:
 
     @classmethod
     def around(cls, lower: np.ndarray, upper: np.ndarray, period: np.ndarray, reach: float, most: int) -> "Grid":
-        """A grid that would need more than about ``most`` cells wraps around. Lengths are in [m]."""
+        """A grid of more than about ``most`` cells is reduced and wraps around. Lengths are in [m]."""
         origin, cell, shape = np.zeros(3), np.full(3, reach), [1, 1, 1]
         for axis in range(len(lower)):
             if period[axis] > 0:

@@ -42,7 +42,7 @@ Named = Mapping[str, Any]
 
 
 def bound(kernel: wp.Kernel, groups: Sequence[Named], given: Named, filled: dict[Any, Any] | None = None) -> list[Any]:
-    """Take each argument from ``given``, or else from the first of the ``groups`` that has its name. Bundles are cached
+    """Take each argument from ``given``, or else from the first group that has the argument's name. Bundles are cached
     in ``filled``."""
     names, arguments = _signature(kernel)
     for name in given:
@@ -130,7 +130,7 @@ def recorded(kernel: wp.Kernel, threads: int, device: Any, **arguments: Any) -> 
 
 
 def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Callable[[], None]) -> None:
-    """Run ``work``, which launches several kernels that can only be repeated together. Watchers get a single launch."""
+    """Run ``work``, which launches several kernels that must be repeated together. Watchers get a single launch."""
 
     def unwatched() -> None:
         watchers = _watchers.copy()
@@ -145,8 +145,7 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 class KernelLauncher:
     """On a CPU, the cores share the launch of a kernel with the neighbourhood argument ``s``. Each launch covers a
-    range of particles, and the kernel computes particle ``s.first + wp.tid()``. The results do not depend on the number
-    of cores."""
+    range of particles, and the kernel computes particle ``s.first + wp.tid()``. Results do not depend on the cores."""
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
         self.particles, self.device, self._record_tape = particles, device, record_tape
@@ -275,7 +274,7 @@ class HostCopy:
     def __init__(self, array: wp.array):
         self._array, self._is_cpu = array, array.device.is_cpu
         self.is_fetched = False
-        """True while the copy of the last `fetch` is complete and up to date, so that `read` does not copy."""
+        """True while the copy made by the last `fetch` is complete and current, so that `read` need not copy again."""
 
     @cached_property
     def _copy(self) -> wp.array:

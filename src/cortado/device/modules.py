@@ -78,8 +78,8 @@ class _Said:
 
 
 def compile_ahead(owner: Any, device: Any, adjoints: bool = False) -> None:
-    """Compile all kernels of an object and its parts in parallel, once per object, except kernels of tangents. If only
-    one module is missing, Warp compiles the module at its first launch."""
+    """Compile all kernels of an object and its parts in parallel, once per object, except kernels of forward mode. If
+    only one module is missing, Warp compiles the module at its first launch."""
     if _ahead.get(id(owner)) is owner:
         return
     _ahead[id(owner)] = owner
@@ -138,7 +138,6 @@ def _compile_all(modules: Sequence[Any], device: Any, cores: int) -> None:
 
 
 def _by_size(kernels: Sequence[wp.Kernel]) -> list[Any]:
-    """Return the modules of the kernels, sorted by decreasing compile time."""
     sizes: dict[Any, int] = {}
     for kernel in kernels:
         source = kernel.adj.source
@@ -237,7 +236,6 @@ def init_warp() -> str | None:
 
 
 def _trouble(folder: str) -> str | None:
-    """Return the reason why a folder cannot store kernels, or None if it can."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             free = shutil.disk_usage(folder).free

@@ -1,7 +1,8 @@
 """The two floating-point precisions, Warp functions in either precision, and Warp types for parameters by their names.
 
 Lanes are GPU threads that share a particle. Each lane processes different neighbours, and every lane gets the sums over
-all lanes with the same bits. The first lane writes the result. Lanes speed up simulations with few particles.
+all lanes with the same bits. The first lane of a particle writes the result. Lanes speed up simulations with few
+particles.
 
 A kernel for lanes is launched with LANES threads per particle. The index of a thread's particle is `wp.tid() // LANES`.
 On a CPU and for Warp's tape there is a single lane.
@@ -80,8 +81,9 @@ class TypesByName:
         @fluid_sum(discretisation, typed)
         def spread(x_ij, x_dot_ij, v_ij, m_i, m_j, s) -> vector: ...
 
-    A parameter without annotation gets its type from the listed names. The longest listed name at the beginning of the
-    parameter's name counts, such as x for x_dot_ij. Without a listed name the parameter gets the usual type.
+    A parameter without annotation gets its type from the listed names. A listed name fits every parameter whose name
+    begins with the listed name, as x fits x_dot_ij. The longest fitting name counts. Without a listed name the
+    parameter gets the usual type.
     """
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
@@ -153,7 +155,7 @@ def _of_the_gpu() -> SimpleNamespace:
 
 
 BY_SIZE = ((2_000, 16), (16_000, 8), (48_000, 4))
-"""Each pair has the greatest number of particles, and the number of lanes on a GPU up to this size."""
+"""Each pair has the greatest number of particles, and the number of GPU lanes up to this number of particles."""
 _OF_MODULES: dict[str, int] = {}
 
 
@@ -172,16 +174,16 @@ def check_sum(kernel: wp.Kernel) -> None:
     source = kernel.adj.source
     if f"{kernel.adj.args[0].label}.first" not in source:
         raise TypeError(
-            f"kernel {kernel.key} takes the neighbourhood s, but does not look where its range of particles "
-            "begins, and every range would write to the first: let it begin with i = s.first + wp.tid()."
+            f"kernel {kernel.key} takes the neighbourhood s, but ignores the first particle of a range, so that every "
+            "range would write to the first particles: begin the kernel with i = s.first + wp.tid()."
         )
     if "wp.tid() // LANES" in source and "lane()" in source:
         return
     for function in _called(kernel.func):
         if getattr(function, "shares_lanes", False):
             raise TypeError(
-                f"kernel {kernel.key} calls the sum {function.key}, which lanes share, but is not made for lanes: let "
-                "it begin with i = s.first + wp.tid() // LANES, and write nothing but where lane() is 0."
+                f"kernel {kernel.key} calls the sum {function.key}, which lanes share, but ignores the lanes: begin "
+                "the kernel with i = s.first + wp.tid() // LANES, and write results only where lane() is 0."
             )
 
 

@@ -1,7 +1,7 @@
 """Sums over particles in a fixed order, so that repeated runs give the same bits.
 
-A reduction first turns the values of each scene into a few partial values. Each partial value is computed by one thread
-on a CPU and by one block of threads on a GPU.
+A reduction first combines the values of each scene into a few partial values. Each partial value is computed by one
+thread on a CPU and by one block of threads on a GPU.
 """
 
 from dataclasses import dataclass

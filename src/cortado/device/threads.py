@@ -122,7 +122,7 @@ class Turn:
     def __enter__(self) -> None:
         if self._lost:
             raise ComputationError(
-                f"a simulation on {self._device} cannot go on in a process that was forked from the one that made it: "
+                f"a simulation on {self._device} cannot continue in a process forked from the simulation's process: "
                 'start processes by "spawn" or "forkserver", as in multiprocessing.get_context("spawn").'
             )
         if not self._lock.acquire(blocking=False):
@@ -197,7 +197,7 @@ class Payload:
 
 @dataclass(frozen=True)
 class Lacking:
-    """The answer of a worker that does not have the function in its cache."""
+    """The answer of a worker that does not have the requested function in the worker's cache."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class TriangleTree:
     starts: NDArray[np.int32]
     """Index of the first triangle of each leaf (leaves + 1,). The last element is the number of triangles."""
     boxes: Points
-    """Lower and upper corner of the box of each node (2 leaves, 6) [m]. Index 0 is unused."""
+    """Lower and upper corner of the bounding box of each node (2 leaves, 6) [m]. Index 0 is unused."""
 
     @classmethod
     def of(cls, corners: Points) -> "TriangleTree":
@@ -53,7 +53,7 @@ class TriangleTree:
         return TriangleTree(corners, self.order, self.starts, boxes)
 
     def nearest(self, points: Points, reach: float = np.inf) -> tuple[Points, Points]:
-        """Beyond ``reach`` [m], the nearest point is the given point, and the distance is ``reach``."""
+        """For a point further than ``reach`` [m] from the mesh, return the point and the distance ``reach``."""
         order = np.arange(len(points))
         if np.isinf(reach) and len(points) > 1:  # along a space-filling curve (Morton 1966)
             lower, sides = points.min(axis=0), np.ptp(points, axis=0)
@@ -74,7 +74,7 @@ class TriangleTree:
 
     def crossings(self, names: Numbers, tolerance: float) -> Numbers:
         """Return the index pairs (m, 2) of triangles that cross by more than ``tolerance`` [m]. Triangles with an equal
-        number in ``names`` (k, 3) share a vertex, where contact is no crossing."""
+        number in ``names`` (k, 3) share a vertex, and contact at a shared vertex is no crossing."""
         count, ordered = len(self.corners), np.ascontiguousarray(names[self.order], dtype=np.int32)
         counts, places, others = (np.zeros(size, dtype=np.int32) for size in (count, count + 1, 1))
         given = {"names": ordered, "tolerance": tolerance, "counts": counts}
@@ -136,8 +136,8 @@ def outer_surface(
     """Return the triangles (n, 3, 3) [m] of a union of closed parts, cut where parts meet, and weights (n,) for surface
     integrals. Triangles inside the union have the weight 0, and coincident triangles share one weight.
 
-    ``pairs`` (m, 2) are all triangles that may meet away from their edges. ``holds`` tests which points (n, 3) are
-    inside a part. The two sides of each triangle are tested at the distance ``reach`` [m].
+    ``pairs`` (m, 2) lists all pairs of triangles that may meet away from their edges. ``holds`` tests which points (n,
+    3) are inside a part. The two sides of each triangle are tested at the distance ``reach`` [m].
     """
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
@@ -158,8 +158,8 @@ def outer_surface(
 
 
 def _cut(corners: Points, others: Points, reach: float) -> tuple[Points, Points]:
-    """Cut a triangle (3, 3) along its intersections with other triangles (m, 3, 3). Return the pieces (n, 3, 3), and
-    the number of triangles (n,) within ``reach`` of each piece's centre."""
+    """Cut a triangle (3, 3) along its intersections with other triangles (m, 3, 3). Return the pieces of the triangle
+    (n, 3, 3), and the number of triangles (n,) within ``reach`` [m] of each piece's centre."""
     side, normal = corners[1] - corners[0], np.cross(corners[1] - corners[0], corners[2] - corners[0])
     if not normal.any():
         return np.zeros((0, 3, 3)), np.zeros(0)
@@ -247,7 +247,7 @@ class Mesh(Solid):
     triangles: Numbers
     """Indices of the vertices of each triangle (k, 3), counterclockwise as seen from outside."""
     parts: Sequence[Numbers] = ()
-    """Indices of the triangles of each part. Empty if the mesh is one part that does not cross itself."""
+    """Indices of the triangles of each part. The list is empty if the mesh is one part that does not cross itself."""
     known_trees: Sequence[TriangleTree] = ()
 
     def moved(self, scale: float, shift: Points) -> "Mesh":

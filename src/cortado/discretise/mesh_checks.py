@@ -21,7 +21,7 @@ LOOKED_AT = 8192
 SAME_WAY = 1e-6
 """Greatest angle between coincident triangles at an edge [rad]."""
 TOGETHER = 1e-3
-"""Angle within which two triangles at an edge have one direction, despite float32 coordinates [rad]."""
+"""Greatest angle between triangles at an edge that count as parallel, because coordinates are float32 [rad]."""
 MEETING = (
     "{what} has {edges} at which three triangles or more meet without closing, the first at {place}, so that nothing "
     "says what is inside: delete faces that divide its inside or stick out of it."
@@ -103,8 +103,8 @@ def _connected(links: Numbers, count: int) -> Numbers:
 
 
 def bodies(edges: Edges, vertices: Points, triangles: Numbers, origin: Points, what: str) -> Numbers:
-    """Return the index of each triangle's body (k,). Triangles at an edge belong to one body if the solid is between
-    them. ``origin`` (3,) is the position of the mesh in the file."""
+    """Return the index of each triangle's body (k,). Two triangles at an edge belong to one body if the solid lies
+    between the two triangles. ``origin`` (3,) is the position of the mesh in the file."""
     sides = np.argsort(edges.names.ravel(), kind="stable")
     first = np.append(0, np.cumsum(edges.counts))[:-1]
     two = edges.counts == 2
@@ -156,11 +156,12 @@ def parts_of(
     mesh: Mesh, tree: TriangleTree, labels: Numbers, crossings: Numbers, some: Numbers, beside: Points
 ) -> tuple[tuple[Numbers, ...], int | None, int | None]:
     """Divide the triangles into parts, so that no two bodies in the same part overlap. No parts are returned if the
-    mesh does not cross itself. Also return a triangle where a body crosses itself, and a triangle of a body inside
-    another body, or None.
+    mesh does not cross itself. Also return a triangle where a body crosses itself, or None, and a triangle of a body
+    inside another body, or None.
 
-    ``labels`` (k,) is the body of each triangle, and ``crossings`` (m, 2) are the triangles that cross. Every body has
-    a triangle with an area in ``some`` (s,). ``beside`` (s, 3) is a point just outside each of these triangles [m].
+    ``labels`` (k,) is the index of each triangle's body, and ``crossings`` (m, 2) are the pairs of triangles that
+    cross. Every body has a triangle with an area in ``some`` (s,). ``beside`` (s, 3) is a point just outside each
+    triangle in ``some`` [m].
     """
     count = int(labels.max()) + 1
     bodies = [np.flatnonzero(labels == body) for body in range(count)]
@@ -257,8 +258,8 @@ def found_mesh(vertices: Points, triangles: Numbers, what: str, rounding: float 
         edges = Edges.of(triangles)
     if not len(triangles):
         raise InputError(
-            f"{what} holds no volume: all of its {count} triangles have no area, or come twice, back to back; give the "
-            "sheet a thickness."
+            f"{what} holds no volume: all of its {count} triangles have no area, or coincide in pairs that face "
+            "opposite ways; give the sheet a thickness."
         )
     edges.check(origin + vertices, what)
     mesh = Mesh(vertices, triangles)
@@ -283,16 +284,16 @@ def _solid_parts(
     wrong = tree.windings(beside) < 0
     if wrong.all():
         raise InputError(
-            f"The normals of {what} point inwards, so that its inside would be outside: turn all of its triangles "
-            "over, as trimesh's mesh.invert() does."
+            f"The normals of {what} point inwards, so that fluid would fill the solid: turn all of its triangles over, "
+            "as trimesh's mesh.invert() does."
         )
     if wrong.any():
         all_bodies, count = len(np.unique(labels)), len(np.unique(labels[some][wrong]))
         which = f"{count} of the {all_bodies} bodies of {what}" if all_bodies > 1 else f"a part of {what}"
         place = place_in_file((origin + mesh.corners[some[np.argmax(wrong)]]).mean(axis=0))
         raise InputError(
-            f"The normals of {which} point inwards, for example at {place}, where there is nothing solid around them: "
-            "turn these triangles over, and mend what crosses itself."
+            f"The normals of {which} point inwards, for example at {place}, where no solid surrounds the triangles: "
+            "turn these triangles over, and repair surfaces that cross themselves."
         )
     notes = []
     parts, crossing, filled = parts_of(mesh, tree, labels, crossings, some, beside)

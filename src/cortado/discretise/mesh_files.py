@@ -26,7 +26,7 @@ ALONG = 0.9
 TOO_LARGE = 100.0
 """Relative size above which a mesh seems to be in a wrong unit. The scale is the container or 100 spacings."""
 PROBES, STEPS, HALVINGS = 20_000, 16, 12
-"""Numbers in the measurement of thickness: surface points, steps for each point, and bisections of the last step."""
+"""Numbers of surface points, of steps for each point, and of bisections of the last step, in measuring thickness."""
 BEYOND = 1e-3
 """Distance behind a wall at which the normal of its back is computed, relative to the length of a step."""
 
@@ -39,8 +39,8 @@ def read_mesh(
     container: tuple[Points, Points] | None = None,
 ) -> Mesh:
     """Read and check the solid in a file. ``scale`` is a factor for the lengths in the file, such as 0.001 for
-    millimetres. ``support`` [m] is None for a region of fluid, which may have any thickness. ``container`` has the
-    lower and the upper corner (3,) [m] of the box around the container."""
+    millimetres. ``support`` [m] is None if the file describes a region of fluid, which may have any thickness.
+    ``container`` has the lower and the upper corner (3,) [m] of the box around the container."""
     found, what = mesh_in_file(path), repr(path)
     mesh = found.mesh.moved(scale, np.zeros(3))
     length = float(np.ptp(mesh.extent(), axis=0).max())

@@ -1,8 +1,9 @@
 """Packing: particles are moved until the fluid has its rest density everywhere, in float64.
 
-Each round solves a nonlinear least-squares problem (Gauss-Newton). A solution moves the density of every particle
-towards the lattice's density and keeps close pairs apart. In the density, walls count with their weights, and air
-counts as fluid. Colagrossi et al. (2012) and Negi and Ramachandran (2021) use repulsion instead.
+Each round of packing solves a nonlinear least-squares problem (Gauss-Newton). A solution moves the density of every
+particle towards the lattice's density and keeps close pairs apart. In the density of a particle, walls count with their
+weights, and points of air count as fluid. Colagrossi et al. (2012) and Negi and Ramachandran (2021) separate particles
+by repulsion instead.
 """
 
 from contextlib import nullcontext
@@ -34,7 +35,7 @@ NO_LIMIT = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class PointsAround:
-    """The points are the particles, followed by fixed points of air and walls."""
+    """The points are all particles, followed by fixed points in the air and in the walls."""
 
     lattice: RestLattice
     points: Points
@@ -42,7 +43,7 @@ class PointsAround:
     weights: Points
     """Weights of the points (m,), relative to a particle [-]."""
     air: tuple[int, int]
-    """First index of the points of air, and the index after the last. Particles marked as ``blind`` ignore air."""
+    """Index of the first point of air, and the index after the last point of air. ``blind`` particles ignore air."""
     lengths: Points
     """Lengths of the periodic box (d,) [m], or 0 along axes without a period."""
     reach: float
@@ -142,7 +143,7 @@ def density_errors(around: PointsAround, sums: Points, stays: Which) -> Points:
 
 
 class Relaxation:
-    """Particles in ``free`` (n,) move, and particles in ``stays`` (n,) ignore air."""
+    """Particles in ``free`` (n,) move. The density of particles in ``stays`` (n,) does not include air."""
 
     def __init__(self, around: PointsAround, stays: Which, free: Which):
         starts, ends, listed = around.lists(around.points[: len(free)], stays)
@@ -224,7 +225,7 @@ MOST_LOOKS, MOST_ROUNDS = 12, 36
 COMPRESSED, DIGITS = 0.03, 6
 """Relative density excess above which a particle may be removed, and decimal places of comparisons."""
 BESIDE, MOST_OUT = 10.0, 40
-"""Least distance between two particles that are removed together [support radii], and greatest number of removals."""
+"""Least distance between two particles that one round removes [support radii], and greatest number of rounds."""
 ROUND_OFF = 1e-9
 MANY = 20_000
 GRAINS = 2.0**13
@@ -250,12 +251,12 @@ class Packing:
         return found.copy(), kept
 
     def errors(self, particles: Points, stays: Which, some: slice | Which = slice(None)) -> Points:
-        """Particles in ``stays`` (n,) ignore air and have an excess of at least 0."""
+        """The density of particles in ``stays`` (n,) does not include air, and their excess is at least 0."""
         around = self._around(particles, self.lattice.support)
         return density_errors(around, around.sums(particles[some], stays[some]), stays[some])
 
     def settled(self, particles: Points, stays: Which) -> tuple[Points, Numbers]:
-        """Particles that remain too compressed, and more so than their neighbours, are removed."""
+        """Particles that remain too compressed, and are more compressed than their neighbours, are removed."""
         kept, found = np.arange(len(particles)), self._at_rest(particles, stays)
         for _ in range(MOST_OUT):
             errors = np.round(self.errors(found, np.ones(len(found), dtype=bool)), DIGITS)
@@ -298,7 +299,6 @@ class Packing:
         return np.asarray((errors > HIGHEST) | (errors < LOWEST))
 
     def _near(self, particles: Points, some: Which, reach: float) -> Which:
-        """Test (n,) which particles are at most ``reach`` [m] from a particle marked in ``some``."""
         others = particles[some]
         reach *= 1.0 + ROUND_OFF
         return PointsAround(self.lattice, others, np.ones(len(others)), (0, 0), self.lengths, reach).near(particles)

@@ -1,7 +1,7 @@
 """Kernels of the packing, in float64: neighbour search, densities, and products with derivatives.
 
-Each pair is listed once and adds to the sums of both particles. Kernels over pairs therefore run in one thread, in a
-fixed order and without atomic additions.
+Each pair of neighbours is listed once and adds to the sums of both particles. Kernels over pairs therefore run in one
+thread, in a fixed order and without atomic additions.
 """
 
 from functools import cache
@@ -28,7 +28,7 @@ class Around:
     weights: wp.array(dtype=real)
     """Weights, relative to a particle [-]."""
     air: wp.int32
-    """First index of the points of air, and the index after the last. Some particles ignore air."""
+    """Index of the first point of air, and the index after the last point of air. Some particles ignore air."""
     behind_air: wp.int32
     is_periodic: wp.bool
     period: vector
@@ -91,7 +91,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
         first: int, x, blind, are_own: bool, around, placed, grid, reach: real, most: int, starts, counts, sums, others
     ):
         """At most ``most`` points are listed for each particle. Particles in ``blind`` ignore air. If ``are_own`` is
-        true, particle i is also point i, and points with an index up to i are skipped."""
+        true, particle i is also point i, and only points with an index above i are listed."""
         i = first + wp.tid()
         x_i = x[i]
         c = cell_of(x_i, grid)
@@ -117,7 +117,7 @@ def packing_kernels(smoothing: SmoothingKernel) -> SimpleNamespace:
 
     @typed.kernel(module)
     def linearise(around, free, starts, ends, listed, close: real, sums, equations, distances):
-        """Pairs with a free particle are added to ``equations``, and to ``distances`` if closer than ``close`` [m]."""
+        """Add pairs with a free particle to ``equations``, and pairs closer than ``close`` [m] to ``distances`` too."""
         i = wp.tid()
         particles = free.shape[0]
         limit = real(1.0) / (around.per_support * around.per_support)

@@ -294,14 +294,12 @@ def outer_edges(profile: Faces) -> Points:
 
 
 def _cut(start: Points, end: Points) -> Points:
-    """If the edge crosses the axis, return the intersection."""
     if start[0] >= 0.0:
         return start
     return np.array([0.0, start[1] + (end[1] - start[1]) * start[0] / (start[0] - end[0])])
 
 
 def _standing(direction: Points) -> Points:
-    """Return a rotation matrix (d, d) that rotates the last axis to a unit vector (d,)."""
     frame = np.stack([*across(direction), direction], axis=1)
     frame[:, 0] *= np.linalg.det(frame)
     return frame

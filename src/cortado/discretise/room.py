@@ -18,7 +18,7 @@ TOLERANCE = 0.5
 
 @dataclass(frozen=True)
 class Region:
-    """A box with corners ``lower`` and ``upper`` (d,) [m], or its part inside a cylinder or sphere."""
+    """A box with corners ``lower`` and ``upper`` (d,) [m], or the part of a box inside a cylinder or sphere."""
 
     lower: Points
     upper: Points
@@ -59,7 +59,7 @@ class Region:
         return np.maximum(from_faces, self._from_axis(points) - self.radius)
 
     def sides(self) -> Iterator[Callable[[Points], Points]]:
-        """Yield a function for each finite side, which returns distances of points. Distances are positive inside."""
+        """Yield a function for each finite side that returns the distances of points from the side, positive inside."""
         for axis in np.flatnonzero(self.across == 0.0).tolist():
             for at, inwards in ((self.lower[axis], 1.0), (self.upper[axis], -1.0)):
                 if np.isfinite(at):
@@ -131,7 +131,7 @@ class Domain:
         return cls(tuple(np.where(axes, lower, 0.0).tolist()), tuple(np.where(axes, lengths, 0.0).tolist()))
 
     def vectors(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Return the lower corner, the lengths and the inverse lengths as Warp vectors."""
+        """Return the lower corner, the lengths and the inverse lengths of the periodic box as Warp vectors."""
         rest = (0.0,) * (3 - len(self.lengths))
         frequency = (1.0 / length if length else 0.0 for length in self.lengths)
         return vector(*self.lower, *rest), vector(*self.lengths, *rest), vector(*frequency, *rest)

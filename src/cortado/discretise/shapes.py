@@ -41,7 +41,7 @@ class Rows:
 
 
 def bisected(holds: Callable[[Points], Which], low: Points, high: Points, halvings: int) -> tuple[Points, Points]:
-    """The condition is true at ``low`` (n,) and false at ``high`` (n,). Return the two bounds (n,)."""
+    """The condition ``holds`` is true at ``low`` (n,) and false at ``high`` (n,). Return the two bounds (n,)."""
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         good = holds(middle)
@@ -55,7 +55,7 @@ class Block:
 
     first: Points
     counts: Points
-    """Numbers of points along the axes (d,), as floats, because they may be larger than any array."""
+    """Number of points along each axis (d,), as floats, because a number may exceed the size of any array."""
     spacings: Points
 
     @cached_property
@@ -84,7 +84,7 @@ def block_between(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
 
 def block_filling(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Block:
     """A lattice that does not fit is stretched or compressed along the axes by at most `MOST_STRETCHED`. The number of
-    points then matches the volume within `EXCESS`. If no lattice fits so well, only the cells inside the box have
+    points then matches the volume within `EXCESS`. If no lattice meets both limits, only cells inside the box have
     points."""
     first, last = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cells, plain = (last - first) / spacing, block_between(lower, upper, spacing)
@@ -132,7 +132,7 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """Return an origin near distant points, or 0. The origin is subtracted exactly, as a multiple of a power of two."""
+    """Return an origin near distant points, or 0. The subtraction of the origin is exact."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))
@@ -307,7 +307,7 @@ def launch_on_cpu(kernel: Any, threads: int, **arguments: Any) -> None:
 
 def recorded_on_cpu(kernel: Any, threads: int, **arguments: Any) -> Callable[[], None]:
     """Return a function that launches a kernel with these arguments, which may be NumPy arrays. Repeated launches are
-    cheaper than by `launch_on_cpu`. They use one core, so that threads may write to the same element."""
+    cheaper than by `launch_on_cpu`. Repeated launches use one core, so that threads may write to the same element."""
     from cortado.device.launching import recorded
     from cortado.device.threads import WARP
 

@@ -1,5 +1,5 @@
-"""Sheets, which are walls without thickness, and their wall particles, in float64. A sheet consists of edges in 2-D and
-of triangles in 3-D."""
+"""Sheets (walls without thickness) and wall particles of sheets, in float64. Sheets are edges in 2-D, triangles in
+3-D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -146,7 +146,7 @@ class Thickened(Solid):
 
 
 def sheet_points(sheet: Sheet, lattice: RestLattice) -> WallPoints:
-    """The wall particles are on both sides and around the ends, at the depths of a flat wall's layers."""
+    """The wall particles lie on both sides and around the ends of a sheet, at the depths of a flat wall's layers."""
     apart, layers = DENSITY * lattice.spacing, lattice.layers
     parts = [surface_points(Thickened(sheet, depth), apart, 0.0) for depth in layers.depths]
     positions = np.concatenate([one.points for one in parts])
@@ -159,7 +159,7 @@ def sheet_weights(
     sheet: Sheet, points: Sequence[Points], flat: Sequence[Points], room: Room, lattice: RestLattice, least: float
 ) -> Points:
     """Return the weights (b,) of a sheet's wall particles, fitted at points at least ``least`` [m] from any surface.
-    The lists ``points`` (b, d) [m] and ``flat`` (b,) begin with the sheet, followed by other walls in the room."""
+    The lists ``points`` (b, d) [m] and ``flat`` (b,) contain first the sheet, then the other walls in the room."""
     spacing, own = lattice.spacing, len(points[0])
     heights = spacing * (np.arange(int(np.ceil(lattice.support / spacing - 0.5))) + 0.5)
     found = np.concatenate([surface_points(Thickened(sheet, height), spacing, 0.0).points for height in heights])

@@ -79,8 +79,8 @@ def smoothing_kernel(name: str) -> SmoothingKernel:
 SKIN = 0.03
 """Extra radius of neighbour lists, relative to the support radius."""
 SLACK = 1e-4
-"""Relative amount by which the density of the rest lattice is below the rest density. At the rest density the
-derivative of the pressure would depend on round-off."""
+"""Relative amount by which the density of the rest lattice is below the rest density. At the rest density, the
+derivative of the pressure by the density would depend on round-off."""
 RATE_LIMIT = 1.5
 """Greatest allowed value of `greatest_rate`. Pressure iterations converge if the rate is below 2."""
 
@@ -98,7 +98,7 @@ def _waves(spacing: float, dimension: int, count: int = 25) -> np.ndarray:
 
 
 def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the particle volume [m^d] that makes the rest lattice less dense than at rest by `SLACK`."""
+    """Return the particle volume [m^d] with which the rest lattice is less dense than the rest density by `SLACK`."""
     distances = np.linalg.norm(lattice_offsets(spacing, support, dimension), axis=1)
     return float((1.0 - SLACK) / kernel.weight(distances, dimension, support).sum())
 
@@ -106,7 +106,7 @@ def rest_volume(kernel: SmoothingKernel, spacing: float, support: float, dimensi
 def _filled(
     kernel: SmoothingKernel, spacing: float, support: float, dimension: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return `lattice_offsets`, the kernel's gradients there (m, d), and the particle volume at rest density [m^d]."""
+    """Return `lattice_offsets`, the kernel's gradients at the offsets (m, d), and the volume at rest density [m^d]."""
     offsets = lattice_offsets(spacing, support, dimension)
     volume = rest_volume(kernel, spacing, support, dimension) / (1.0 - SLACK)
     return offsets, kernel.gradient(offsets, support), volume

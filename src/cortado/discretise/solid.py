@@ -107,7 +107,7 @@ class Solid(ABC):
         return self.distance(points)
 
     def own_feet(self, fine: float) -> tuple[Points, Points] | None:
-        """Return surface points and outward unit vectors (n, d), or None if the points must be found from a lattice."""
+        """Return surface points and outward unit vectors (n, d), or None if a lattice search must find the points."""
         return None
 
     def outward(self, points: Points) -> Points:

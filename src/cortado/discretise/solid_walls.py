@@ -20,11 +20,11 @@ Near = Callable[[Points, float], Which]
 FINE = {2: 12, 3: 3}
 """Number of candidate points on a surface per spacing, by dimension."""
 CELLS = (3, 4)
-"""Subdivisions of a cell along each axis, in two refinements near a surface. The last number must be even."""
+"""Parts of a cell along each axis, in two successive refinements near a surface. The last number must be even."""
 APART, LEAST_APART = 0.78, 0.65
 """Least distance between chosen points, and least distance after the points are moved [spacings]."""
 FIRST, GROWTH = 0.05, 1.7
-"""Fraction of the candidate points that is tested first, and growth factor of later portions of candidates."""
+"""Fraction of the candidate points in the first tested portion, and growth factor of later portions."""
 ROUNDS = {2: 40, 3: 4}
 """Number of rounds of Lloyd's algorithm, by dimension."""
 OFF_FACES = (0.31, 0.17, 0.23)
@@ -43,7 +43,7 @@ class SurfacePoints:
 
 
 def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
-    """A negative ``depth`` [m] means above the surface. In thin parts of the solid the points are in the middle."""
+    """A negative ``depth`` [m] means above the surface. In thin parts of the solid the points lie halfway through."""
     fine = spacing / FINE[len(solid.extent()[0])]
     feet, away = surface_feet(solid, fine)
     points, tolerance = feet - depth * away, 1e-3 * depth
@@ -62,8 +62,8 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
     """First, as many points as possible are chosen at a least distance. Each point then moves to the candidate nearest
-    to the centroid of its closest candidates (Lloyd 1982). Finally, points that are too close are removed and gaps are
-    filled. ``fine`` [m] is the distance between candidates."""
+    to the centroid of its closest candidates (Lloyd 1982). Finally, points closer than a least distance are removed,
+    and candidates fill gaps. ``fine`` [m] is the distance between candidates."""
     dimension = candidates.shape[1]
     if not len(candidates):
         return SurfacePoints(candidates, np.zeros(0))
@@ -160,7 +160,7 @@ def _chosen(points: Points, order: Numbers, apart: float, chosen: Numbers) -> Nu
 
 
 def _nearest(some: Points, points: Points, reach: float = np.inf) -> tuple[Points, Numbers]:
-    """Return the distance from each of ``points`` to the nearest of ``some``, or infinity, and the nearest's index."""
+    """Return the distance from ``points`` to the nearest point in ``some``, or infinity, and this point's index."""
     from scipy.spatial import cKDTree
 
     workers = usable_cores() if len(points) > MANY else 1
@@ -284,8 +284,8 @@ class ExposedSurface:
         return np.asarray(self.owner[self._tree.query(walls.positions + walls.feet)[1]])
 
     def beneath(self, depth: float) -> SurfacePoints:
-        """Return points about a spacing apart, ``depth`` [m] below the surface or in the middle of thinner parts.
-        Points are left out near wall particles of the container that keep their positions."""
+        """Return points about a spacing apart, ``depth`` [m] below the surface or in the middle of thinner parts. No
+        points lie near container wall particles that keep their positions."""
         thin = np.flatnonzero(~self._is_nearest(slice(None), np.full(len(self.feet), depth)))
         ends = np.zeros(len(thin)), np.full(len(thin), depth)
         low, _ = bisected(lambda depths: self._is_nearest(thin, depths), *ends, EXPOSED_HALVINGS)
@@ -321,7 +321,7 @@ class ExposedSurface:
         return np.concatenate([np.zeros((0, self.feet.shape[1])), *found])
 
     def _feet_of(self, points: Points, reach: Points, nearest: Numbers) -> Points:
-        """``nearest`` (n,) is the index of the nearest fine point, and ``reach`` (n,) [m] is its distance."""
+        """``nearest`` (n,) is the index of the nearest fine point, and ``reach`` (n,) [m] its distance."""
         fine = self._fine
         found, owner = self.feet[nearest], self.owner[nearest]
         best, furthest = np.full(len(points), np.inf), float(reach.max(initial=0.0)) + fine
@@ -370,7 +370,7 @@ def _is_exposed(feet: Points, away: Points, container: ContainerWalls) -> Which:
 
 
 def solid_places(solid: Solid, spacing: float, reach: float) -> Places:
-    """The first points are half a spacing from the surface, and further points follow at each spacing."""
+    """The first points lie half a spacing from the solid's surface, and further points follow at each spacing."""
     heights = spacing * (np.arange(int(np.ceil(reach / spacing - 0.5))) + 0.5)
     points = np.concatenate([surface_points(solid, spacing, -height).points for height in heights])
     return Places(points, frames(solid.outward(points)))

@@ -133,8 +133,8 @@ def side_of_edge(p: vector, a: vector, b: vector) -> wp.int32:
 
 @wp.func
 def crossing(p: vector, a: vector, b: vector, c: vector) -> wp.int32:
-    """Return 1 if a ray along the last axis leaves the solid through a triangle. Return -1 if the ray enters the solid,
-    and 0 if the ray misses the triangle."""
+    """Return 1 if a ray along the last axis leaves the solid through a triangle. Return -1 if the ray enters the solid
+    through the triangle, and 0 if the ray misses the triangle."""
     around = side_of_edge(p, a, b) + side_of_edge(p, b, c) + side_of_edge(p, c, a)
     if around == 0 or p[2] > wp.max(a[2], wp.max(b[2], c[2])):
         return int(0)

@@ -1,5 +1,5 @@
-"""Place layers of wall particles around boxes and cups, and compute the weights of wall particles in the density. All
-computations use float64."""
+"""Place layers of wall particles around boxes and cups, and compute the weights of wall particles in the density, in
+float64."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ def nearest_cells(length: float, spacing: float) -> int:
 
 
 def box_walls(lower: Points, upper: Points, periodic: Sequence[bool], spacing: float, depth: float) -> Points:
-    """Return one layer of points (n, d) around a box, ``depth`` [m] outside, except along periodic axes. The points
-    continue the lattice inside the box, stretched slightly if a side is not a multiple of the spacing."""
+    """Return one layer of points (n, d) at the distance ``depth`` [m] outside a box. Periodic axes have no such points.
+    The points continue the lattice inside the box, stretched slightly if a side is not a multiple of the spacing."""
     inside = [_cells(a, b, nearest_cells(b - a, spacing)) for a, b in zip(lower, upper, strict=True)]
     outside = [
         np.zeros(0) if open_axis else np.array([a - depth, b + depth])
@@ -139,7 +139,8 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer, which exists only if the second fluid layer's kernel reaches the wall [spacings]."""
+"""Depth of the shallow layer of wall particles [spacings]. It exists only if the second fluid layer's kernel reaches
+the wall."""
 
 
 @dataclass(frozen=True)
@@ -272,9 +273,9 @@ def wall_weights(
     density at all places. A uniform pressure pushes no particle less than a spacing from a wall, as in
     `RestLattice.layers`.
 
-    ``flat`` (b,) are the weights in a flat wall, of which the last ``known`` weights are final. If the wall particles
+    ``flat`` (b,) are the weights in a flat wall. The last ``known`` of these weights are final. If the wall particles
     are on lattices (``are_even``), weights are at least 0, and otherwise at least `LEAST` times ``flat``. ``crossed``
-    is given for the wall particles of a sheet, with which fluid interacts only across the sheet.
+    is given only for the wall particles of a sheet. Such particles interact only with fluid across the sheet.
     """
     from scipy.sparse import coo_array, vstack
 

@@ -214,7 +214,7 @@ def make_folder(path: Path) -> None:
 
 
 BEYOND = 2**30
-"""Offset of the locked byte on Windows. The byte is far behind the content, so that the file remains readable."""
+"""Offset of the byte locked on Windows, far behind the content, so that other programs can read the file."""
 
 
 def lock(file: int) -> None:

@@ -308,7 +308,6 @@ def held() -> Iterator[None]:
 
 
 def _first_said(stop: BaseException | None) -> str:
-    """Return the text of the interruption that was handled first."""
     if not isinstance(stop, Interrupted):
         return ""
     return stop.kept or _first_said(None if stop.__suppress_context__ else stop.__context__)

@@ -1,13 +1,15 @@
 """Write frames of particles to one temporal VTKHDF file for ParaView. The file remains readable if the run is killed.
 
-The file has room for every frame from the beginning. Every dataset is contiguous, sparse on disk and at a fixed offset.
-`PointOffsets` maps a frame to its data. Datasets that count points and cells have two parts: one for all particles, and
-an empty part for missing frames. `PartOffsets` selects one of the parts for each frame. Changing this number makes a
-frame appear, so that readers never see a change of size.
+The file has room for every frame of the run from the beginning. Every dataset is contiguous, sparse on disk and at a
+fixed offset. The dataset `PointOffsets` maps a frame to the data of the frame. Datasets that count points and cells
+have two parts: one for all particles, and an empty part for missing frames. The dataset `PartOffsets` selects one of
+the two parts for each frame. A change of the selected part makes a frame appear, so that readers never see a change of
+size.
 
 HDF5 only creates the file in memory, because it crashes on a full disk (HDF5 2.0). Plain writes copy the file to disk
-and add frames. One write of eight bytes then stores the number of frames and their CRC-32. HDF5's checksums and its
-mode for one writer and many readers are not used. After a killed process VTK cannot open such files.
+and add frames. One write of eight bytes then stores the number of frames and the CRC-32 of the frames. HDF5's checksums
+and its mode for one writer and many readers are not used. VTK cannot open files with such checksums or in this mode
+after the writing process was killed.
 
 Format: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format/vtkhdf_specifications.html
 """
@@ -359,9 +361,9 @@ def read(path: str | Path) -> dict[str, Any]:
     missing, damaged, or not a trajectory of Cortado.
 
     The result has times (frames,) [s], steps (frames,), positions (frames, n, d) [m], velocities (frames, n, d) [m/s],
-    and every scalar field (frames, n). The keys others, constants and diagnostics have tables of arrays by name: others
-    for every frame, constants of the run, and diagnostics for every step (steps,). The key origin has a text, and marks
-    has None or two numbers."""
+    and every scalar field (frames, n). The keys others, constants and diagnostics contain tables of arrays by name:
+    others for every frame, constants of the run, and diagnostics for every step (steps,). The key origin contains a
+    text, and the key marks contains None or two numbers."""
     import h5py
 
     if not Path(path).is_file():

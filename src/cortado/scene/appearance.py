@@ -172,7 +172,7 @@ class Dolly(CameraPath):
 
     kind: Literal["dolly"] = "dolly"
     distance: Annotated[float, quantity(gt=0.0, le=100.0)] = 0.6
-    """Final distance of the camera from the middle of the picture, as a multiple of the initial distance."""
+    """Final distance of the camera from the middle of the picture, as a multiple of the camera's initial distance."""
 
     def view(self, home: View, moment: Moment) -> View:
         factor = self.distance ** (moment.share * moment.share * (3.0 - 2.0 * moment.share))
@@ -261,7 +261,7 @@ class Picture(Table):
     """Horizontal angle of view [degrees], in 3-D."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
     """Fraction of light that passes through a layer of fluid, from 0 to 1, in 3-D. The layer is a tenth as thick as the
-    container is long. If left out, it is 0.9 for a single phase in its own colour, and 0 in all other cases."""
+    container is long. The default is 0.9 for a single phase in its own colour, and otherwise 0."""
     floor: Flag = True
     """Whether the picture shows a floor, in 3-D."""
     light: Annotated[str, OneOf(LIGHTS)] = "studio"
@@ -276,7 +276,7 @@ class Picture(Table):
     """Whether the fluid is drawn with light and shadow. If false, fluid has exactly the colours of the colour scale."""
     film_frames: Annotated[int, count(0, 1_000_000)] | None = None
     """Number of frames of a film, evenly chosen from the recorded states. If left out, a film has 25 frames per second.
-    With 0 no film is made. A search records this number of states for its films, by default 121."""
+    With 0 no film is made. A search records `film_frames` states for its films, by default 121."""
     film_speed: Annotated[float, quantity(gt=0.0)] | None = None
     """Simulated seconds per second of the film; 1 is real time. If left out, the film runs in real time, or at a speed
     for a length of 4 to 10 s."""

@@ -100,14 +100,14 @@ class Knots:
         return found.reshape(len(times), *self.values.shape[1:])
 
     def _weights(self, times: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the factor of the ramp at ``times``, and its time derivative [1/s]."""
+        """Return the factor of the ramp at ``times``, and the time derivative of this factor [1/s]."""
         s = np.clip(np.asarray(times) / self.ramp, 0.0, 1.0).reshape(-1, *(1,) * (self.values.ndim - 1))
         return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * (s * (1.0 - s)) ** 2 / self.ramp
 
 
 def fastest(moved: Iterable[tuple[float, Knots]], times: NDArray) -> NDArray[np.float64]:
     """Return the greatest speed in each interval between ``times`` (k,) [s]. ``moved`` are pairs of a factor and a
-    curve. The speed is the sum over the curves of factor times magnitude of the time derivative."""
+    curve. The speed is a sum over the curves: factor times magnitude of the curve's time derivative."""
     inner = _within(times).ravel()
     sizes = [factor * np.linalg.norm(one.rates(inner).reshape(len(inner), -1), axis=1) for factor, one in moved]
     return np.append(sum(sizes, np.zeros(len(inner))).reshape(-1, len(WITHIN)).max(axis=1), 0.0)
@@ -176,7 +176,7 @@ def values_in_file(file: str, columns: Columns, needs_all: bool) -> tuple[NDArra
 
 
 def lists_in_file(table: Any, path: FieldPath, columns: Columns, what: str, needs_all: bool) -> dict[str, Any]:
-    """Return the lists in a table's CSV file, by keys of the table such as ``times`` and ``torques``."""
+    """Return the lists in a table's CSV file as values of keys of the table, such as ``times`` and ``torques``."""
     names = [name for name, _ in columns]
     for key in (*names, "times", *(f"{name}s" for name in names)):
         if (found := getattr(table, key)) is not None:
@@ -315,8 +315,8 @@ def _check_times(path: FieldPath, times: Sequence[float] | None) -> None:
 
 
 def check_over_time(path: FieldPath, table: Any, values: str, constant: str) -> None:
-    """Check that ``times`` increase from 0, that the key ``values`` has a value for each time, and that the key
-    ``constant`` is left out."""
+    """Check that ``times`` increase from 0, that ``values`` has a value for each time, and that ``constant`` is left
+    out."""
     _check_times(path, table.times)
     given, wanted = getattr(table, values), f"a list of {len(table.times)}, as are times"
     if given is None or len(given) != len(table.times):

@@ -252,7 +252,7 @@ def discretise(scene: Scene) -> DiscreteScene:
     if masses.off:
         warn(
             f"the fluid begins with {' and '.join(masses.off.values())}: boxes whose sides are whole multiples of the "
-            "spacing have exactly what is asked for, and of other shapes a smaller spacing comes nearer.",
+            "spacing have exactly the prescribed mass, and a smaller spacing reduces the error of other shapes.",
             MassWarning,
         )
     if most := scene.discretisation.jitter * spacing:

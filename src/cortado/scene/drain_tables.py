@@ -41,7 +41,7 @@ class BoxDrain(Ordered):
         return np.array([-none if self.lower is None else self.lower, none if self.upper is None else self.upper])
 
     def middle(self, dimension: int) -> Points:
-        """Return the middle (d,) [m]. Along an axis with only one limit, return the coordinate of this limit."""
+        """Return the middle (d,) [m]. Along an axis with one limit, return the coordinate of the limit."""
         ends = self.ends(dimension)
         return np.where(np.isfinite(ends), ends, np.where(np.isfinite(ends[::-1]), ends[::-1], 0.0)).mean(axis=0)
 
@@ -149,7 +149,7 @@ class SinkDrain(FlowTable):
     """(d,) Centre of the sink [m], in the fluid or on a wall."""
     radius: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Radius of the sphere in which particles are removed [m]; two and a half spacings if left out. The sink prescribes
-    the flow in a shell of three spacings around the sphere. In a second shell of three spacings the flow changes
+    the flow in a shell of three spacings around the sphere. In a second shell of equal width the flow changes
     smoothly."""
 
     def middle(self, dimension: int) -> Points:

@@ -37,8 +37,8 @@ class EmitterSample:
     """Length of the column of fluid that waits behind the opening [m]."""
 
     def in_line(self, name: str, first: int, others: Any, particles: int) -> Points:
-        """Return the initial distance of each particle upstream of the opening (particles,) [m]. The distance is 0 for
-        particles of other emitters and bodies.
+        """Return each particle's initial distance from the opening, measured upstream (particles,) [m]. The distance is
+        0 for particles of other emitters and bodies.
 
         ``first`` is the index of the emitter's first particle. ``others`` are fields of a state.
         """
@@ -93,16 +93,16 @@ class EmitterTable(FluidBody, FlowTable):
     """Length of the column of fluid that waits behind the opening [m]; six spacings if left out."""
     volume: Annotated[float, quantity("m3 (m2 in 2-D)", gt=0.0)] | None = None
     """Total volume that the emitter emits [m3], in 2-D area [m2]. If left out, commands such as ``cortado run`` provide
-    enough fluid for the run, but `Simulation` provides only the waiting column (see `Scene.lasting`)."""
+    enough fluid for the run, but `Simulation` provides only the column behind the opening (see `Scene.lasting`)."""
     fed_by: tuple[Text, ...] = ()
-    """Names of drains. The emitter emits the particles that these drains remove. Besides these particles, the emitter
-    has only the waiting column and `volume`. A drain can feed only one emitter."""
+    """Names of drains. The emitter emits the particles that these drains remove. Besides the particles from drains, the
+    emitter has only the waiting column and `volume`. A drain can feed only one emitter."""
     path: OutletPath | None = None
     """Position of the middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """Largest random offset of a particle from its lattice position, along each axis of the opening, in spacings. The
-    offsets are equal in all runs. With the solver "projection" the default is 0.05, because a stream on an exact
-    lattice is too wide."""
+    offsets are equal in all runs. The default in "projection" is 0.05, because a stream on an exact lattice is too
+    wide."""
 
     @field_validator("direction")
     @classmethod
@@ -193,7 +193,6 @@ class EmitterTable(FluidBody, FlowTable):
         return sample.positions[sample.upstream < sample.column]
 
     def _cells(self, spacing: float) -> Points:
-        """Return the number of lattice cells along each axis of the opening (d - 1,)."""
         sides = self.sides or (2.0 * (self.radius or 0.0),) * (len(self.outlet) - 1)
         return np.maximum(whole_cells(np.array(sides), spacing), 1.0)
 

@@ -18,9 +18,9 @@ from cortado.scene.scene import Scene
 FINER = 4
 """Number of equal parts of a lattice cell along each axis, for measuring the volume of a body of fluid."""
 LOOSENESS, MOST_LOOSENESS = 0.05, 0.008
-"""Greatest fractions of the particles that a packed body may lack: near its surface, and in the whole body."""
+"""Greatest missing fraction of the particles of a packed body: near the body's surface, and in the whole body."""
 BESIDE = 2
-"""Greatest distance from the surface at which particles are left out, along each axis [cells]."""
+"""Greatest distance between the surface and a particle that may be left out, along each axis [cells]."""
 FAR = 4.0
 """Greatest distance from the surface that is computed [spacings]."""
 DIGITS = 6
@@ -254,7 +254,7 @@ class FluidMasses:
 
     @property
     def off(self) -> dict[str, str]:
-        """Return messages about masses that differ by more than the fraction `EXCESS`, by phase name."""
+        """Return messages about masses that differ from the prescribed mass by more than `EXCESS`, by phase name."""
         return {
             name: f"{given:.4g} kg of {name}, where {self.asked[name]:.4g} kg were asked for"
             for name, given in self.given.items()

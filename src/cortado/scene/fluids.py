@@ -114,7 +114,7 @@ class Turnable(RegionFluid):
 
 
 class BoxFluid(BoxShape, Turnable):
-    """A box of fluid. Its particles are at ``lower + (i + 1/2) spacing``, or packed if the box is rotated.
+    """A box of fluid. Particles are at ``lower + (i + 1/2) spacing``. In a rotated box, particles are packed.
 
     If a side is no multiple of the spacing, the lattice is stretched or compressed by up to 3 %. The mass is then right
     within 0.3 %. If no such lattice fits, the particles are packed, and the mass is up to 0.8 % too small. `describe`

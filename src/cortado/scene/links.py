@@ -58,8 +58,8 @@ class HingeTable(Table):
     speeds: tuple[Annotated[float, quantity("rad/s")], ...] | None = None
     """(k,) Target angular velocities of the motor at `times`, in place of `speed` [rad/s]."""
     file: File | None = None
-    """CSV file in place of `times`, `torques` and `speeds`. It has a column `time`, and a column `torque` or `speed` or
-    both, with units in the header. A relative path starts at the scene file's folder."""
+    """CSV file in place of `times`, `torques` and `speeds`. The file has a column `time`, and at least one of the
+    columns `torque` and `speed`, with units in the header. A relative path starts at the scene file's folder."""
 
     @property
     def turned_by(self) -> str | None:
@@ -127,7 +127,7 @@ def _three(vector: Any) -> Three:
 
 
 def inertia_about(hold: Hold, mass: Mass) -> np.ndarray:
-    """Return the inertia (3, 3) about the hinge, without a hinge about the centre of mass, in the body's frame."""
+    """Return the inertia (3, 3) in the body's frame about the hinge, or about the centre of mass without a hinge."""
     arm = np.array(hold.arm)
     return np.asarray(mass.inertia + mass.volume * (arm @ arm * np.eye(3) - np.outer(arm, arm)))
 
@@ -172,7 +172,8 @@ def check_hinges(hinges: Sequence[HingeTable], solids: Sequence[SolidTable], dim
 def number_of(
     name: str, of: str, end: str, unit: str, what: str, value: float, values: Range, change: float
 ) -> Parameter:
-    """Create a scalar parameter. ``change`` is its typical change at the value 0, or if it may be negative."""
+    """Create a scalar parameter. ``change`` is the parameter's typical change at 0, or everywhere if values may be
+    negative."""
 
     def changed(source: Source, at: NDArray[Any]) -> NDArray[np.float64]:
         return np.where((np.asarray(at) == 0.0) | (values is Range.ANY), change, np.abs(at))

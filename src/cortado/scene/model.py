@@ -141,10 +141,9 @@ class DiscretisationTable(Table):
     """Distance between particles at rest [m]."""
     support: Annotated[float, quantity(ge=1.2, le=4.0)] = 2.0
     """Support radius divided by the spacing. Particles closer than the support radius interact. With the solver
-    "projection" the default is 2.6, unless the kernel is given."""
+    "projection", the default support is 2.6, unless the key `kernel` is given."""
     kernel: Literal["cubic_spline", "wendland_c2", "wendland_c4"] = "cubic_spline"
-    """Name of the smoothing kernel. With the solver "projection" the default is "wendland_c2", unless the support is
-    given."""
+    """Name of the smoothing kernel. The default in "projection" is "wendland_c2", unless `support` is given."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
     """Largest random offset of a particle from its initial position, along each axis, in spacings. The offsets are
     equal in all runs. With the solver "projection" and all axes periodic the default is 0.05, because fluid on an exact
@@ -184,8 +183,8 @@ class FixedForces(Table):
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
     """Form of the viscous force: "stress" or "pairwise", or "none" for no force. The form "stress" is accurate within 1
     % for a shear wave with 40 particles per wavelength. It exerts no force on fluid in rigid rotation. The form
-    "pairwise" (Monaghan 2005) exists only for the solver "pcisph". Its viscosity is 0.6 to 1.4 times the given
-    viscosity, depending on the direction of the shear."""
+    "pairwise" (Monaghan 2005) exists only for the solver "pcisph". The effective viscosity of "pairwise" is 0.6 to 1.4
+    times the given viscosity, depending on the direction of the shear."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
     """Time integration of the viscous stress. Explicit integration limits the time step. Implicit integration solves a
     system of equations in each step, and works with any time step. The value "automatic" means implicit if the time

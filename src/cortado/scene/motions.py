@@ -19,8 +19,7 @@ from cortado.scene.tables import MISSING, FieldPath, Several, Table, field_error
 
 
 class Course(Table):
-    """Values of a parameter over time. The values are constant before the first and after the last of the
-    given times."""
+    """Values of a parameter over time. Values are constant before the first and after the last time."""
 
     columns: ClassVar[Callable[[int], Columns]]
     """Function that returns the columns of the CSV file for a number of dimensions."""
@@ -31,8 +30,8 @@ class Course(Table):
     values: Any = None
     """(k, components) Values of the parameter at `times`, in the unit of the parameter."""
     file: File | None = None
-    """A CSV file in place of `times` and `values`. It has a column time [s], and columns x, y and z, or tilt, or tilt_x
-    and tilt_z, with units. A relative path starts at the scene file's folder."""
+    """A CSV file in place of `times` and `values`. The file has a column time [s], and columns x, y and z, or a column
+    tilt, or columns tilt_x and tilt_z, with units. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
     """Interpolation between the times: linear, or by a cubic spline with zero slope at both ends."""
     ramp: Ramp | None = None
@@ -136,8 +135,8 @@ def moving(solids: Sequence[SolidTable]) -> list[SolidTable]:
 
 
 def wall_numbers(solids: Sequence[SolidTable]) -> dict[str, int]:
-    """Return the numbers that wall particles store, by name of the solid. Moving solids have the numbers 0, 1, ..., and
-    solids at rest have -2, -3, ...."""
+    """Return the number by which wall particles refer to each solid, by name of the solid. Moving solids have the
+    numbers 0, 1, ..., and solids at rest have -2, -3, ...."""
     resting = [solid for solid in solids if not solid.moves]
     numbers = {solid.name: number for number, solid in enumerate(moving(solids))}
     return numbers | {solid.name: -2 - number for number, solid in enumerate(resting)}
@@ -179,7 +178,7 @@ def reach(solid: SolidTable, values: Mapping[str, Any]) -> float:
 
 
 position_name = ending("position")
-"""Name of the parameter for the initial position of a solid's middle, and of the field for the current one [m]."""
+"""Name of the parameter for the initial position [m] of a solid's middle, and of the field for the current position."""
 rotation_name = ending("rotation")
 scale_name = ending("scale")
 displacement_name = ending("displacement")
@@ -285,7 +284,7 @@ def courses(solid: SolidTable) -> tuple[Steady | Knots, Steady | Knots]:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a moving solid. Its rotation matrix (3, 3) is `turned` times the matrix of `begun`."""
+    """Pose of a moving solid. The rotation matrix (3, 3) of the solid is `turned` times the matrix of `begun`."""
 
     name: str
     is_free: bool

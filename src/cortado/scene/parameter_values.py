@@ -29,7 +29,7 @@ def reference_density_tangent(
 def reference_density_adjoint(
     fractions: np.ndarray, rest_density: np.ndarray, reference_density_bar: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the adjoints of both arguments, given the adjoint of the density of mixtures (n,)."""
+    """Return the adjoints of ``fractions`` and ``rest_density``, given the adjoint of the density of mixtures (n,)."""
     by_volume = (reference_density_bar * reference_density(fractions, rest_density) ** 2)[:, None] / rest_density
     return -by_volume, (by_volume * fractions / rest_density).sum(axis=0)
 
@@ -190,7 +190,8 @@ def check_known(name: str, scene: Any, what: str = "parameter", known: Known = R
 
 
 def require_points(points: Any, are_read: bool = True) -> None:
-    """Check ``points``. If ``are_read`` is false, any iterable is allowed, and its tables are not checked."""
+    """Check ``points``. If ``are_read`` is false, any iterable is allowed, and the tables in ``points`` are not
+    checked."""
     is_fit = isinstance(points, Sequence) and len(points) > 0 if are_read else isinstance(points, Iterable)
     if not is_fit or isinstance(points, (str, bytes, Mapping)):
         raise InputError(f"points is {shown(points)}, but must be a list with a table of parameters for each point.")

@@ -72,7 +72,7 @@ class Parameter:
     change: Callable[[Source, NDArray], Any] = lambda source, value: np.abs(value)
     """Function that returns the size of a typical change of the parameter, given a scene and the parameter's value."""
     acts: Callable[[Source, Mapping[str, NDArray]], bool] = lambda source, values: True
-    """Function that tells if the parameter has an effect, given a scene and all parameter values by name."""
+    """Function that returns True if the parameter has an effect, given a scene and all parameter values by name."""
     present: Callable[[Any], bool] = lambda scene: True
     absent: str = ""
     """Reason why a scene may lack the parameter, such as "has only one phase"."""
@@ -82,7 +82,7 @@ class Parameter:
     """True for a parameter of an optional force."""
     longest_step: Limit = lambda scene, values: inf
     moment: float = 0.5
-    """Instant within a time step at which a time-dependent value is read: 0 is the start of the step, 1 the end."""
+    """Instant in a time step at which the solver reads a time-dependent value: 0 at the start, 1 at the end."""
     grows: bool = False
     """True if the parameter is a displacement since the start of a run."""
     in_place_of: str | None = None

@@ -1,8 +1,9 @@
 """Reads points from NumPy files and from the formats of VTK.
 
-The libraries VTK and HDF5 trust the contents of a file. A damaged file may make them hang, use all memory or crash. A
-separate process with limited time and memory, ``python -m cortado.scene.point_files FILE``, therefore reads such files.
-It writes the points (n, 3) or (n, 2) in NumPy's format to standard output, or a reason with the exit code `REFUSED`.
+The libraries VTK and HDF5 trust the contents of a file. A damaged file may make VTK or HDF5 hang, use all memory or
+crash. A separate process with limited time and memory, ``python -m cortado.scene.point_files FILE``, therefore reads
+VTK and HDF5 files. The process writes the points (n, 3) or (n, 2) in NumPy's format to standard output, or a reason
+with the exit code `REFUSED`.
 """
 
 import io
@@ -53,7 +54,6 @@ def _by_vtk(path: str) -> Any:
 
 
 def _hdf5(path: str) -> Any:
-    """Read the points of the first time step."""
     import h5py
 
     with h5py.File(path, "r") as file:

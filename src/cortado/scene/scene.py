@@ -76,9 +76,9 @@ class Scene(SceneTables):
     def lasting(self, time: float | None = None, steps: int | None = None) -> "Scene":
         """Return the scene with enough fluid in its emitters for ``time`` [s], or for ``steps`` steps.
 
-        An emitter is unchanged if the scene gives its volume, if drains feed it, or if its column of fluid is long
-        enough. The scene is unchanged if all axes are periodic. Raises `InputError` if the particles would not fit into
-        memory.
+        An emitter is unchanged if the scene gives the emitter's volume, if drains feed the emitter, or if the fluid
+        column behind the opening is long enough. The scene is unchanged if all axes are periodic. Raises `InputError`
+        if the particles would not fit into memory.
         """
         spacing = self.discretisation.spacing
         if steps is not None:
@@ -124,8 +124,8 @@ class Scene(SceneTables):
 
     @classmethod
     def from_json(cls, text: str | bytes, overrides: Sequence[str] = (), file: str = "scene.json") -> "Scene":
-        """Read a scene from the JSON of `to_json`, with overrides as for `load_scene`. Error messages use ``file`` as
-        the name of the scene file."""
+        """Read a scene from the JSON of `to_json`, with overrides as for `load_scene`. Error messages call the scene
+        file ``file``."""
         if not isinstance(text, (str, bytes)):
             raise InputError(f"text is {shown(text)}, but must be the text that Scene.to_json gives.")
         try:
@@ -250,7 +250,7 @@ def read_toml(
     is invalid. Tables in ``unread`` cannot be overridden.
 
     An override is ``key=value``, such as ``forces.gravity=[0,-5,0]``, ``fluid.0.upper=[1,1,1]`` or
-    ``fluid[0].upper=[1,1,1]``. A list entry can be given by its name in place of its index:
+    ``fluid[0].upper=[1,1,1]``. An entry of a list can be given by the entry's name in place of the entry's index:
     ``phase.oil.viscosity=0.1``. A value that is not valid TOML is read as text.
     """
     file = as_path("path", path)

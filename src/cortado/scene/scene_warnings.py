@@ -29,7 +29,7 @@ OF_SPACE = ("surface", "field_of_view", "transparency", "floor")
 
 
 def given(table: Table, *names: str) -> Iterator[str]:
-    """Yield each of ``names`` for which the table has a value other than the default."""
+    """Yield the keys in ``names`` that have a value other than the default in the table."""
     for name in names:
         field = type(table).model_fields.get(name)
         if field is not None and getattr(table, name) != field.default:
@@ -49,7 +49,7 @@ def idle_sentences(scene: SceneTables) -> Iterator[str]:
 
 
 Idle = tuple[FieldPath, Table, tuple[str, ...], str]
-"""The path of a table, the table, names of its keys without effect, and the reason."""
+"""Path of a table, the table itself, the names of keys without effect, and the reason."""
 
 
 def _idle(scene: SceneTables) -> Iterator[Idle]:

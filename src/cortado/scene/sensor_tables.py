@@ -57,7 +57,7 @@ class WaveGaugeTable(SensorTable):
     """Name of a moving solid that carries the column along."""
     axes: Axes = "world"
     """Axes of a column that a solid carries. With "body", the column rotates with the solid, and heights are measured
-    along the solid's axes. With "world", the column stays upright, and heights are measured in the scene."""
+    along the solid's axes. With "world", the column stays upright, and heights are measured along the scene's axes."""
 
 
 class FlowRateTable(SensorTable):

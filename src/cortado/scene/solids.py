@@ -1,4 +1,4 @@
-"""The keys that all solids of a scene have."""
+"""Keys that every solid of a scene has."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -79,7 +79,7 @@ class SolidTable(Coloured):
     of mass."""
     angular_velocity: Turns[Annotated[float, quantity("rad/s")]] = None
     """Constant angular velocity about the solid's middle [rad/s]; for a free body, the initial angular velocity. The
-    value is a vector in 3-D, and one number in 2-D, positive for a counterclockwise rotation."""
+    value is a vector in 3-D. In 2-D the value is one number, positive for a counterclockwise rotation."""
     surface_velocity: OnAxes[Annotated[float, quantity("m/s")]] = None
     """(d,) Velocity of the sliding surface of a solid at rest, such as a conveyor belt, in the solid's frame [m/s]."""
     side: Literal["outside", "inside"] = "outside"
@@ -93,7 +93,7 @@ class SolidTable(Coloured):
     material, or [0.55, 0.55, 0.58] without a material."""
     transparency: Annotated[float, quantity(ge=0.0, le=1.0)] | None = None
     """Fraction of the light that passes through the solid in pictures, from 0 to 1. The default is the transparency of
-    the material. Without a material the default is 0, or 1 for a solid with fluid inside."""
+    the material. Without a material, the default is 1 for a solid with fluid inside, and otherwise 0."""
 
     @property
     def finish(self) -> Finish:
@@ -129,7 +129,7 @@ class SolidTable(Coloured):
         return turned.model_copy(update={"position": tuple((middle - turned._arm()).tolist())})
 
     def _arm(self) -> Points:
-        """Return the vector from the centroid to the centre of mass (d,) [m]; zero (1,) if they coincide."""
+        """Return the vector from the centroid to the centre of mass (d,) [m], or zero (1,) if both points coincide."""
         arm = self.centre_of_mass
         return np.zeros(1) if arm is None else np.asarray(self.turn(len(arm)) @ np.array(arm))
 
@@ -158,11 +158,11 @@ class SolidTable(Coloured):
         return surface_cells(*self.shape_about()[0].extent(), spacing)
 
     def solid(self) -> Solid:
-        """Return the region that fluid cannot enter: the body, or the outside of a tank."""
+        """Return the region that fluid cannot enter: the body of a solid, or the outside of a tank."""
         return Hollow(self.body()) if self.side == "inside" else self.body()
 
     def own_solid(self) -> Solid:
-        """Return the region that fluid cannot enter, unrotated and with the solid's middle at the origin."""
+        """Return the region that fluid cannot enter, for an unrotated solid with its middle at the origin."""
         shape = self.shape_about()[0]
         if self.centre_of_mass is not None:
             return Placed(shape, -np.array(self.centre_of_mass), np.eye(len(self.centre_of_mass)))

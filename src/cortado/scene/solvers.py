@@ -14,7 +14,7 @@ OWN = ("projection", "pcisph")
 """Names of Cortado's solvers. The first solver is the default."""
 COURANT = 0.2
 Suits = tuple[tuple[str, Mapping[str, Any]], ...]
-"""Pairs of the name of a table and the default values of keys in this table."""
+"""For each table, the name of the table and the default values of its keys."""
 
 
 class SolverTable(Table):
@@ -75,14 +75,14 @@ class ProjectionSolver(SolverTable):
     density."""
     velocities_follow: Flag = False
     """If true, velocities are adapted to the new positions when a step shifts particles. Flows in full containers then
-    lose less speed, but flows with a free surface can gain energy."""
+    lose less speed than otherwise, but flows with a free surface can gain energy."""
     suits: ClassVar[Suits] = (
         ("discretisation", {"kernel": "wendland_c2", "support": 2.6}),
         ("emitter", {"jitter": 0.05}),
     )
     """Default values of keys in other tables; see `docs/projection.md`."""
     suits_without_surface: ClassVar[Suits] = (("discretisation", {"jitter": 0.05}),)
-    """Default values of keys in other tables if all axes are periodic."""
+    """Default values of keys in other tables, for scenes in which all axes are periodic."""
 
     @model_validator(mode="after")
     def _check_iterations(self) -> Self:

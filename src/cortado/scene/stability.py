@@ -128,8 +128,8 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     Viscosity: a fraction of the longest stable explicit time step on a lattice; see `VISCOUS_RATES`.
 
     Depth: C s^(3/2) / (H sqrt(|g|)) for fluid of depth H, where the factor C is from `DEPTH_FACTORS`. With a coarse
-    pressure grid, the limit is C s / sqrt(H |g|), where C is `RESTING` or `RUNNING`. In a tilted container, H is the
-    depth in the lowest corner.
+    pressure grid, the limit of the time step is C s / sqrt(H |g|), where C is `RESTING` or `RUNNING`. In a tilted
+    container, H is the depth in the lowest corner.
 
     Friction: 0.25 s^2 / nu for no-slip free bodies in fluid of kinematic viscosity nu.
 

@@ -128,7 +128,6 @@ def _in_a_list(value: Any) -> Any:
 
 
 def _few(most: int) -> Any:
-    """Describe a field for one number in 2-D, and for a list of numbers in 3-D."""
     return Field(min_length=1, max_length=most, fail_fast=True, json_schema_extra={"maxItemsIn2D": 1})
 
 
@@ -295,7 +294,7 @@ class Table(BaseModel, metaclass=Documented):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     beside: ClassVar[tuple[str, ...]] = ()
-    """Names of tables that a file may also contain, and that other modules read."""
+    """Names of additional tables in a file, which other modules read."""
     _instead: ClassVar[Mapping[int, str]] = {}
     """Names of shapes that replace this shape in 2 or 3 dimensions, if this shape does not exist there."""
 
