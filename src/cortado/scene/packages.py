@@ -148,9 +148,9 @@ def registered(group: str, kind: str, own: Collection[str], advice: str) -> Entr
     for entry in found:
         if entry.name in own:
             sentence = (
-                f'cannot be read: {_package_of(entry)} registers "{entry.name}" under {group}, the name of'
+                f'cannot be read: {_package_of(entry)} registers "{entry.name}" under {group}, which is a name of'
             )
-            raise SceneError(None, "kind", kind, sentence=f"{sentence} a built-in part: the package must choose another.")
+            raise SceneError(None, "kind", kind, sentence=f"{sentence} Cortado's own; the package must choose another.")
     same = list({(entry.value, _package_of(entry)): entry for entry in found if entry.name == kind}.values())
     if not same:
         names = ", ".join(sorted({f'"{entry.name}"' for entry in found})) or "which there is none"
