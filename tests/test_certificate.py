@@ -373,7 +373,7 @@ def test_beyond_the_step_in_which_a_moved_copy_loses_a_particle_there_is_no_answ
     seen = horizon.sample_steps <= 10
     np.testing.assert_array_equal(horizon.difference[seen], wanted.difference[seen])
     assert seen.sum() > 5 and np.isnan(horizon.difference[~seen]).all()
-    sentence = "Beyond step 10 there is no answer for gravity: a run that the perturbation of gravity moves loses"
+    sentence = "Beyond step 10 nothing is known about gravity: a run with a changed gravity loses"
     assert sentence in str(found) and "Up to step 10 of 16" in str(found) and found.estimator != "Exact()"
     json.dumps(found.as_dict(), allow_nan=False)
     assert gradient_check(found, tmp_path / "certificate.png").stat().st_size
@@ -392,7 +392,9 @@ def test_beside_a_corner_a_copy_may_lose_a_particle(step, reached, monkeypatch):
     losing(monkeypatch, step, lambda _, values: np.abs(values.get("initial_velocities", 0.0)).max() > 1e-3)
     found = corners(ON_ITS_CORNERS)
     assert found.right and not found.consistency.right
-    assert f"Beyond step {reached} nothing is checked beside the corner: that run loses a particle." in str(found)
+    assert f"Beside the corner, nothing is checked beyond step {reached}: the changed run loses a particle." in str(
+        found
+    )
     assert (found.beside is None) == (reached == 0) and (not reached or found.beside.last_converged == 8)
 
 
@@ -402,7 +404,7 @@ def test_the_copy_in_float64_may_lose_a_particle(monkeypatch):
     losing(monkeypatch, 9, lambda one, values: one.simulation.precision.name == "float64")
     found = certify(problem)
     assert found.right and found.steps == 8 and found.horizon == 8
-    assert "Beyond step 8 there is no answer: in float64, in which gradients are certified, the run loses" in str(found)
+    assert "Nothing is checked beyond step 8: certificates use float64, in which the run loses" in str(found)
     losing(monkeypatch, 3, lambda *_: True)
     with pytest.raises(DivergedError, match="diverged in step 3"):
         certify(problem)

@@ -175,7 +175,7 @@ def test_what_does_not_fit_is_a_sentence(device):
         (lambda: several.step(state), "of a simulation with other arrays"),
         (lambda: Simulation(plane(), device).step(state), "of another simulation, but must be of this simulation"),
         (lambda: state["pressure"], "has no 'pressure', but has positions"),
-        (lambda: simulation.step(state, {"rest_density": 900.0}), "to be given again"),
+        (lambda: simulation.step(state, {"rest_density": 900.0}), "of the first run again"),
         (lambda: pickle.dumps(state), "cannot be pickled or copied"),
         (lambda: simulation.on_host(3), "state is 3, but must be a DeviceState"),
         (lambda: simulation.step(state, {"gravity": on_device(np.zeros((3, 2)), "float32")}), "is a float32 array"),

@@ -161,7 +161,7 @@ def test_a_run_says_when_its_emitter_runs_dry():
     slot = {**supplied().emitter[0].model_dump(), "direction": [1.0, 0.0]}
     for made, name in ((supplied(volume=0.02), "volume"), (jet(emitter=[slot], fluid=[], container=room), "length")):
         assert made.lasting(1.0) is made
-        with pytest.warns(CortadoWarning, match=f"runs dry at .*: a larger emitter\\[0\\].{name} gives it more"):
+        with pytest.warns(CortadoWarning, match=f"runs dry at .*: a larger emitter\\[0\\].{name} gives more fluid"):
             Simulation(made, precision="float64").run(time=0.252)
 
 

@@ -136,7 +136,7 @@ def test_a_state_of_another_spacing_is_refused(factor, known):
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("phase.0.rest_density=900", "density of 900 kg/m3, but must be of one with a rest density of 1000 kg/m3"),
+        ("phase.0.rest_density=900", "density of 900 kg/m3, but must be of a run with a rest density of 1000 kg/m3"),
         ('discretisation.kernel="wendland_c2"', "the kernel wendland_c2"),
         ("container.periodic=[true,false]", "periods of"),
     ],
@@ -168,7 +168,7 @@ def test_a_run_with_a_rest_density_goes_on_with_it_and_not_without(make):
     state = simulation.run(5, controls).last_state
     rest = simulation.run(7, controls, state=state)
     assert rest.positions.tobytes() == whole.positions[5:].tobytes()
-    assert "to be given again where it goes on" in refused(simulation, state)
+    assert "give the rest density of the first run again" in refused(simulation, state)
     refused(simulation, replace(state, origin=None))
     refused(simulation, simulation.run(5).last_state, controls)
 

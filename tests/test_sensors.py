@@ -377,8 +377,11 @@ NOWHERE = {
     "a gauge outside": (WaveGauge([0.9, 0.0], 0.3), "outside of the container.*its floor, 0.3 m"),
     "a floor in millimetres": (WaveGauge([0.3, 0.0], 50.0), "has its floor at 50 m, above the container"),
     "a plane outside": (FlowRate([0.9, 0.0], [1.0, 0.1]), "has its plane through .* outside of the container"),
-    "a floor below the container": (WaveGauge([0.3, 0.0], -5.0), "floor at -5 m, .* begins at 0 m: it reads 5 m less"),
-    "a radius in millimetres": (WaveGauge([0.3, 0.0], radius=50.0), "radius of 50 m, more than the container"),
+    "a floor below the container": (
+        WaveGauge([0.3, 0.0], -5.0),
+        "floor at -5 m, .* begins at 0 m: the reading is 5 m less",
+    ),
+    "a radius in millimetres": (WaveGauge([0.3, 0.0], radius=50.0), "radius of 50 m, more than the size"),
     "a region without walls": (WallForce([0.3, 0.35], [0.32, 0.37]), "without walls"),
 }
 
@@ -425,7 +428,7 @@ def test_a_sensor_that_solids_shut_off_is_warned_of_but_for_a_gap(dimension, rec
         simulation = cortado.Simulation(within_plates(dimension, gap), precision="float64")
         Watch(simulation, simulation.rollout(1), sensors=probes)
     (found,) = (str(one.message) for one in recwarn if "the sensor" in str(one.message))
-    words = "shut off from all fluid by solids: it reads 0, or what is within its radius"
+    words = "shut off from all fluid by solids: the reading is 0, or what is within its radius"
     assert "'in' is at" in found and words in found
 
 

@@ -255,7 +255,7 @@ def test_a_solid_that_jumps_is_warned_of():
     with pytest.warns(CortadoWarning, match=r"the solid 'rotor' goes 0\.3 m in step 1 of this run, which is further"):
         simulation.run(2, controls={"rotor.displacement": [0.3, 0.0], "rotor.turn": 0.0})
     first = simulation.run(4, controls={"rotor.position": [0.3, 0.3]})
-    with pytest.warns(CortadoWarning, match=r"is given rotor\.position as the first one was"):
+    with pytest.warns(CortadoWarning, match=r"needs rotor\.position of the first run"):
         simulation.run(1, state=first.last_state)
     with warnings.catch_warnings():
         warnings.simplefilter("error", CortadoWarning)
@@ -267,9 +267,9 @@ def test_a_solid_that_jumps_is_warned_of():
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"rotor.scale": 1.6}, r"'rotor' is 1\.6 times as large .*, but its walls hold for 0\.6 to 1\.5"),
-        ({"ball.scale": 1.4}, r"'ball' is 1\.4 times as large .* and reaches 0\.06 m, more than a spacing"),
-        ({"floor.scale": 1.1}, r"'floor' is 1\.1 times as large .*, so that it does not fill a period"),
+        ({"rotor.scale": 1.6}, r"'rotor' is 1\.6 times as large .*, but the scale must be from 0\.6 to 1\.5"),
+        ({"ball.scale": 1.4}, r"'ball' is 1\.4 times as large .* and covers 0\.06 m, more than a spacing"),
+        ({"floor.scale": 1.1}, r"'floor' is 1\.1 times as large .*, so that the solid no longer fills a period"),
     ],
 )
 def test_a_size_that_walls_do_not_hold_is_warned_of(given, sentence):

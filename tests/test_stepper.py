@@ -67,7 +67,7 @@ def test_a_state_of_a_step_cannot_be_changed_and_one_that_is_made_of_it_is_judge
     crowded[3] = crowded[5]
     with pytest.raises(InputError, match="particles 3 and 5 at one place"):
         simulation.step(replace(state, fields={**state.fields, "positions": crowded}))
-    with pytest.raises(InputError, match="to be given again"):
+    with pytest.raises(InputError, match="of the first run again"):
         simulation.step(state, {"rest_density": 900.0})
     again = pickle.loads(pickle.dumps(state))
     assert_same_state(simulation.step(again), simulation.step(state))
@@ -377,18 +377,14 @@ WRONG_BARS = [
     ({"positions": np.zeros((63, 3))}, r"has shape \(63, 3\), but must be \(\d+, 3\)"),
     ({"time": [1.0]}, r"time has shape \(1,\)"),
     ({"velocities": "fast"}, "velocities"),
-    ({"time": np.inf}, "time has a value that is not finite, but must be"),
+    ({"time": np.inf}, "time has a value that is not finite, but all values must be"),
     (None, "must be a table"),
 ]
 
 
 def test_derivatives_directions_and_residuals_that_do_not_fit_are_sentences():
     simulation = Simulation(two_layers(mixture={**MIXING, "mobility": 0.0}))
-    state, stepper, not_its_own = (
-        simulation.state(),
-        simulation.stepper(2),
-        "returned by this stepper's step",
-    )
+    state, stepper, not_its_own = simulation.state(), simulation.stepper(2), "returned by this stepper's step"
     residual, velocities = stepper.step(state)[1], {"initial_velocities": simulation.velocities}
     for call, words in [
         (lambda: stepper.jvp(residual, {}, velocities), "give the directions of the state's fields"),

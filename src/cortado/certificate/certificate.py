@@ -193,7 +193,7 @@ def certify(
         raise InputError(f"steps is {shown(steps)}, but must be left out, {own}.")
     if problem.simulation.batch is not None:
         raise InputError("problem has a batch of scenes, but must have a single scene: certify one scene of the batch.")
-    problem.simulation.scene.solver.fixed_time_step("a certificate, whose differences would not hold chosen ones")
+    problem.simulation.scene.solver.fixed_time_step("a certificate, whose finite differences need fixed time steps")
     double = in_float64(problem)
     chosen = checked_parameters(double, parameters)
     try:
@@ -205,8 +205,8 @@ def certify(
         if shorter is None:
             raise
         made = _certified(shorter, first_rows(double, chosen, shorter.steps), perturbation, seed)
-        copied = f"in float64, in which gradients are certified, the run loses a particle in step {error.step}"
-        return replace(made, beyond=(f"Beyond step {shorter.steps} there is no answer: {copied}.", *made.beyond))
+        copied = f"certificates use float64, in which the run loses a particle in step {error.step}"
+        return replace(made, beyond=(f"Nothing is checked beyond step {shorter.steps}: {copied}.", *made.beyond))
 
 
 def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int) -> Certificate:
@@ -221,7 +221,9 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
         beside, reached = _beside(problem, values, along, random)
         wrong = wrong if beside is not None and not beside.right else ()
         if reached < problem.steps:
-            beyond.append(f"Beyond step {reached} nothing is checked beside the corner: that run loses a particle.")
+            beyond.append(
+                f"Beside the corner, nothing is checked beyond step {reached}: the changed run loses a particle."
+            )
 
     sizes = scales(problem, chosen, perturbation)
     asked = {} if wrong else chosen
@@ -233,13 +235,13 @@ def _certified(problem: Problem, chosen: Arrays, perturbation: float, seed: int)
     time = float(known["time_step"]) * max(problem.steps, 1)
     horizons = tuple(horizon(history, chosen, name, perturbations[name]) for name in asked)
     for one in horizons:
-        moved = f"a run that the perturbation of {one.parameter} moves"
+        moved = f"a run with a changed {one.parameter}"
         if one.reached == one.sample_steps[-1]:
             continue
         if one.reached == 0:
-            beyond.append(f"Of {one.parameter} there is no horizon: {moved} cannot begin, or loses a particle at once.")
+            beyond.append(f"{one.parameter} has no horizon: {moved} cannot begin, or loses a particle at once.")
         else:
-            answer = f"there is no answer for {one.parameter}"
+            answer = f"nothing is known about {one.parameter}"
             beyond.append(f"Beyond step {one.reached} {answer}: {moved} loses a particle.")
     return Certificate(
         particles=problem.simulation.particles,

@@ -317,7 +317,7 @@ class SensorMatch:
         if found.shape != self.target.shape:
             columns = ", ".join(self.sensor.columns(end.dimension))
             said = f"values has {len(self.target)} columns"
-            raise InputError(f"{said}, but must have the {len(found)} columns of the sensor: {columns}.")
+            raise InputError(f"{said}, but must have {len(found)}, like the sensor: {columns}.")
         return np.where(np.isnan(self.target), 0.0, found - self.target) / self.scale
 
 

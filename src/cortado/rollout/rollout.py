@@ -76,7 +76,7 @@ class AdjointStep:
 class Rollout(Staying):
     """Steps of a solver from a first state. ``steps`` may change between evaluations, up to ``room``."""
 
-    instead = "but the simulation that it is of can"
+    instead = "but the simulation of the rollout can"
 
     @WARP
     def __init__(self, solver: Solver, steps: int, memory_budget: int = MEMORY_BUDGET):

@@ -107,8 +107,8 @@ class FirstPositions:
             found = check_crowding("particles at initial_positions", free, *of_lattice, period)
             least = nearest(free).min() / spacing
             if found is None and least < NEAREST:
-                wanted = f"at least {NEAREST:g} of them"
-                found = f"particles at initial_positions are only {least:.2g} spacings apart, which should be {wanted}."
+                wanted = f"at least {NEAREST:g} spacings"
+                found = f"particles at initial_positions are only {least:.2g} spacings apart, but should be {wanted}."
         self._judged[member] = positions.copy()
         told, self._warned = self._warned, self._warned or found is not None
         return None if told else found
@@ -123,7 +123,7 @@ SCALES = (0.6, 1.5)
 def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, courses: dict[str, Changing]) -> str | None:
     """Return a sentence about the first invalid path or scale, or None. ``run`` has values of all steps."""
     spacing, furthest = scene.discretisation.spacing, FURTHEST * scene.discretisation.spacing * (1.0 + 1e-6)
-    left = f"which is further than a spacing, {spacing:g} m: fluid is left behind in it"
+    left = f"which is further than a spacing, {spacing:g} m: fluid may end up inside"
     if wrong := _stretched(scene, values):
         return wrong
     for what, moved in moved_by(scene, values, courses).items() if scene.solver.chooses else ():
@@ -131,7 +131,7 @@ def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, cours
         sizes = travel.at(travel.times + travel.least) - travel.lengths
         if (size := sizes.max()) > furthest:
             when = f"in {travel.least:.2g} s, the shortest step there is, at {travel.times[sizes.argmax()]:g} s"
-            return f"{what} goes {size:.3g} m {when}, {left}. Give it more time."
+            return f"{what} goes {size:.3g} m {when}, {left}. Slow the motion."
     for table in told(scene.solid):
         if scene.solver.chooses and displacement_name(table.name) in courses:
             continue
@@ -141,7 +141,7 @@ def path_sentence(scene: Scene, first: State, values: Arrays, run: Arrays, cours
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)  # in a batch those of the first scene
         if (size := steps.max(initial=0.0)) > furthest:
             found = f"the solid {table.name!r} goes {size:.3g} m in step {steps.argmax() + 1} of this run, {left}"
-            later = f"a run that goes on from a state is given {position} as the first one was"
+            later = f"a run that continues from a state needs {position} of the first run"
             return f"{found}. A displacement begins near 0, and {later}."
     return None
 
@@ -154,14 +154,14 @@ def _stretched(scene: Scene, values: Arrays) -> str | None:
             continue
         start = f"the solid {table.name!r} is {scale:.4g} times as large as in the scene"
         if not least <= scale <= most:
-            return f"{start}, but its walls hold for {least:g} to {most:g} times: give it another size there."
+            return f"{start}, but the scale must be from {least:g} to {most:g}."
         size = float(np.ptp(table.shape_about()[0].extent(), axis=0).max())
         grown = 0.5 * size * (1.0 - scale if table.side == "inside" else scale - 1.0)
         if grown > FURTHEST * scene.discretisation.spacing and "initial_positions" not in values:
-            return f"{start} and reaches {grown:.3g} m, more than a spacing, over what may be fluid there."
+            return f"{start} and covers {grown:.3g} m, more than a spacing, of possible fluid: give initial_positions."
         lower, upper = table.solid().extent()
         if ((periods > 0.0) & (upper - lower > periods * (1.0 - WHOLE))).any():
-            return f"{start}, so that it does not fill a period of the container, as it does there."
+            return f"{start}, so that the solid no longer fills a period of the container."
     return None
 
 
@@ -286,9 +286,9 @@ WORDS = {
     "periods": "periods of {} m",
     "waiting": "{} particles in emitters",
     "rest_density": "a rest density of {} kg/m3",
-    "solver": "what {} carries from step to step",
+    "solver": "the additional state fields of {}",
 }
-ADVICE = {"rest_density": "; a rest density that a run was given is to be given again where it goes on"}
+ADVICE = {"rest_density": "; give the rest density of the first run again"}
 
 
 def _listed(value: object) -> str:
@@ -337,12 +337,14 @@ def trouble(rollout: Rollout, scene: Scene) -> Iterator[str]:
         yield torn
     solves = noted.get(Solve.name, np.zeros(0))
     if missed := np.count_nonzero(solves >= Solve.most):
-        found = f"the viscosity did not converge in {missed} of {solves.size} steps, in which it took {Solve.most}"
+        found = (
+            f"the viscosity did not converge in {missed} of {solves.size} steps, in which the solve took {Solve.most}"
+        )
         yield f"{found} iterations: try a smaller time step."
     last, end = rollout.clocks[0].after(rollout.taken, 0.0), rollout.step_sizes.end
     if not rollout.lost and last.time < end < np.inf:
-        found = f"the run ended at {last.time:.4g} s, before the time that was asked for, as steps became as short as"
-        yield f"{found} {last.time_step:.2g} s: go on from its last state, or try a larger spacing."
+        found = f"the run ended at {last.time:.4g} s, before the requested time, as steps became as short as"
+        yield f"{found} {last.time_step:.2g} s: continue from the last state, or try a larger spacing."
     if scene.solver.chooses and (dry := dry_sentence(scene, rollout)):
         yield dry
     if rollout.lost:
@@ -356,7 +358,7 @@ def not_converged_sentence(converged: np.ndarray, scene: Scene) -> str:
     spacing = scene.discretisation.spacing
     for index, emitter in enumerate(scene.emitter):
         if not scene.container.contains(emitter.particles(spacing), -0.25 * spacing).all():
-            why = f"the column that waits in emitter[{index}] is not all inside the container, whose walls press on it"
+            why = f"a part of the column in emitter[{index}] is outside the container, whose walls press on the column"
             advice = f"{why}. Shorten emitter[{index}].length, or make the container larger."
     return f"the pressure did not converge in {np.count_nonzero(~converged)} of {converged.size} steps: {advice}"
 
@@ -372,7 +374,7 @@ def divergence_sentence(diagnostics: Mapping[str, np.ndarray], scene: Scene) -> 
     where = f"step {step + 1}" + "".join(f" of scene {b}" for b in member)
     many = f"more than {TORN:g} in {np.count_nonzero(torn > TORN)} of {torn.size} steps"
     advice = "try a smaller time step, more solver.iterations or a solver.tolerance"
-    return f"the projection left a divergence of {torn.max():.2g} in {where}, times the step, and {many}: {advice}."
+    return f"the projection left a divergence times time step of {torn.max():.2g} in {where}, and {many}: {advice}."
 
 
 def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
@@ -387,9 +389,9 @@ def dry_sentence(scene: Scene, rollout: Rollout) -> str | None:
         supply, end = emitter.supply(spacing) * spacing, times[-1]
         if emitter.fed_by or lengths[-1] * (1.0 - 1e-6) <= supply:
             continue
-        advice = f"scene.lasting({end:.4g}) has more in reserve, as has a scene with emitter[{index}].volume"
+        advice = f"scene.lasting({end:.4g}) has more fluid in reserve, as has a scene with emitter[{index}].volume"
         if emitter.volume is not None or scene.lasting(end) is scene:
-            advice = f"a larger emitter[{index}].{'length' if emitter.volume is None else 'volume'} gives it more"
+            advice = f"a larger emitter[{index}].{'length' if emitter.volume is None else 'volume'} gives more fluid"
         dry = np.interp(supply, lengths, times)
-        return f"{emitter.name} runs dry at {dry:.4g} s of a run to {end:.4g} s, as all of it is out: {advice}."
+        return f"{emitter.name} runs dry at {dry:.4g} s of a run to {end:.4g} s, as all its fluid is out: {advice}."
     return None

@@ -79,7 +79,7 @@ class StepResidual(Staying):
     values: Arrays
     rows: Mapping[str, wp.array]
     place: HostStates
-    instead = "but the state before its steps and the parameters can, from which they are taken again"
+    instead = "but the state before the steps and the parameters can: take the steps again"
 
     def __repr__(self) -> str:
         steps = counted(self.evaluation.rollout.steps, "step")

@@ -323,10 +323,13 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
         reads = f"its floor, {sensor.floor:g} m" if isinstance(sensor, WaveGauge) else "0"
         is_far = ends is not None and np.abs(place).max() > 10.0 * np.abs(ends).max()
         reads += f", or what is within its {key}{' (positions are in metres)' if is_far else ''}"
-        return f"{what} {point_in_words(place)} m, {' and '.join(dict.fromkeys(filter(None, there)))}: it reads {reads}"
+        where = " and ".join(dict.fromkeys(filter(None, there)))
+        return f"{what} {point_in_words(place)} m, {where}: the reading is {reads}"
     wide = getattr(sensor, key)
     if wide is not None and wide < 0.5 * spacing:
-        return f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: it sees next to no particles"
+        return (
+            f"has a {key} of {wide:g} m, less than half a spacing of {spacing:g} m: the sensor sees almost no particles"
+        )
     if ends is None:
         return _far_away(simulation, sensor, reach_of(wide, simulation))
     if isinstance(sensor, WaveGauge) and (said := _of_column(scene, ends, sensor)):
@@ -334,7 +337,7 @@ def _doubt(simulation: Prepared, sensor: Any) -> str | None:
     size = float(np.linalg.norm(np.subtract(*ends)))
     if wide is None or wide <= size or any(scene.periods[1]):
         return None
-    return f"has a {key} of {wide:g} m, more than the container, which is {size:g} m across: it reads no place in it"
+    return f"has a {key} of {wide:g} m, more than the size {size:g} m of the container: the reading belongs to no place"
 
 
 def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
@@ -348,7 +351,7 @@ def _far_away(simulation: Prepared, sensor: Any, reach: float) -> str | None:
     if gap <= reach + size:
         return None
     begins = f"the fluid and the solids, which begin from {point_in_words(ends[0])} to {point_in_words(ends[1])} m"
-    return f"is {gap:.4g} m from {begins}: it reads nothing unless fluid comes so far (positions are in metres)"
+    return f"is {gap:.4g} m from {begins}: the reading is 0 unless fluid comes so far (positions are in metres)"
 
 
 def _of_things(simulation: Prepared) -> tuple[Points, Points]:
@@ -366,7 +369,7 @@ def _of_column(scene: Scene, ends: tuple[Points, Points], gauge: WaveGauge) -> s
     stands = any(table.solid().distance_up_to(foot[None], near)[0] < near for table in scene.solid)
     if abs(gauge.floor - bottom) > near and not stands:
         reads = f"{abs(gauge.floor - bottom):g} m {'more' if gauge.floor > bottom else 'less'} than the level"
-        return f"has its floor at {gauge.floor:g} m, but the container begins at {bottom:g} m: it reads {reads} there"
+        return f"has its floor at {gauge.floor:g} m, but the container begins at {bottom:g} m: the reading is {reads}"
     return None
 
 
@@ -414,10 +417,10 @@ def _without_walls(simulation: Prepared, sensor: WallForce) -> str | None:
     if len(lower) != d or len(upper) != d:
         return None  # refused where it is read
     if not len(walls):
-        return "reads forces on walls, but the scene has none: it reads 0"
+        return "reads forces on walls, but the scene has no walls: the reading is 0"
     reach = simulation.lattice.support + 0.5 * simulation.scene.discretisation.spacing
     if simulation.lattice.domain.within(walls, lower - reach, upper + reach)[1].any():
         return None
     ends = " to ".join(point_in_words(end) for end in (walls.min(axis=0), walls.max(axis=0)))
     region = f"from {point_in_words(lower)} to {point_in_words(upper)} m"
-    return f"looks at a region {region} without walls: all are within {ends} m, and it reads 0"
+    return f"reads a region {region} without walls: all walls are within {ends} m, and the reading is 0"

@@ -35,7 +35,7 @@ FIGURES = (
     *(f"{name}.mp4" for name in _FILMS),
 )
 """Names of the figures that runs write. All other files in the folder belong to the user."""
-TO_RESUME = "; choose another --out, or begin one without --resume"
+TO_RESUME = "; choose another --out, or begin a run without --resume"
 
 
 class _Entry:
@@ -88,7 +88,7 @@ class RunFolder:
         return folder
 
     @classmethod
-    def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of one") -> Self:
+    def open(cls, path: str | Path, otherwise: str = ", but RUN must be the folder of a run") -> Self:
         """Open the folder of a run. Raises `InputError` if there is no run. The message ends with ``otherwise``."""
         folder = cls(Path(path).absolute())
         if not folder._holds_run():

@@ -304,7 +304,7 @@ def shut_in(containment: Containment, member: int, points: Points) -> str | None
     if found is None:
         return None
     gap = f"{max(best, 0.0):.2g} m apart" if best > STEP * spacing else "with no room between them"
-    return f"fluid is shut in by {found}, {gap}, nearer than a spacing: leave one, or make the spacing smaller"
+    return f"fluid is shut in by {found}, {gap}, nearer than a spacing: leave a spacing, or make the spacing smaller"
 
 
 def _normals(distance: Distance, points: Points, step: float) -> Points:
