@@ -178,7 +178,7 @@ class RandomizedSmoothing(Ensemble):
         g = mean over samples of sum_k (L(u + r q_k) - L(u - r q_k)) / (2 r) q_k,   r = sqrt(N),
 
     where q_1 ... q_N is an orthonormal basis, rotated at random in every sample. The two losses of a difference have
-    the same perturbed initial positions. g is the gradient of the loss averaged over the ball of an `Ensemble`.
+    the same perturbed initial positions. The gradient g belongs to the loss averaged over the ball of an `Ensemble`.
 
     Bias: the average removes features of the loss narrower than the spread, as intended. Noise: the ``standard_error``
     of the `Estimate`. Cost: 2 N forward runs per sample, so N should be a few dozen at most.

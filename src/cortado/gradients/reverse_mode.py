@@ -216,9 +216,9 @@ class AdjointViscosity(AdjointEstimator):
         w_ij = W_ij / max(S_i, S_j, W(h / 2)),                S_i = sum_j W_ij.
 
     Here x_i and v_i are positions and velocities of the state, W is the smoothing kernel with the support radius h, and
-    dt is the time step. s_i is the strength of the viscosity, gamma_i the strain rate, w_ij a weight, and S_i a kernel
-    sum. The weights are symmetric and sum to at most 1, and the strength is at most 0.6. The viscosity therefore
-    conserves the sum of the a_i, and does not increase the norm of a.
+    dt is the time step. Particle i has the strength s_i of the viscosity, the strain rate gamma_i and the kernel sum
+    S_i. A pair has the weight w_ij. The weights are symmetric and sum to at most 1, and the strength is at most 0.6.
+    The viscosity therefore conserves the sum of the a_i, and does not increase the norm of a.
 
     After the blending, the length of each vector a_i is limited to ``limit`` times the root mean square over all
     particles. In a flow without strain the adjoints are not limited. `docs/gradients.md` explains both.

@@ -148,9 +148,9 @@ class SnapshotAdjoint:
 
 ADJOINT_FIELDS = ("positions", "velocities", "mass_fractions")
 Adjoint = State | SnapshotAdjoint | tuple[np.ndarray, ...] | Mapping[str, np.ndarray]
-"""Derivatives of a loss in one of three forms: a tuple of arrays for positions and velocities (n, d) and, optionally,
-mass fractions (n, phases); a `State` of Warp arrays; or a table by state field and quantity. Missing derivatives with
-respect to state fields are 0.
+"""Derivatives of a loss in one of three forms. The first form is a tuple of arrays for positions and velocities (n, d)
+and, optionally, mass fractions (n, phases). The other forms are a `State` of Warp arrays and a table by state field and
+quantity. Missing derivatives with respect to state fields are 0.
 """
 
 

@@ -7,9 +7,9 @@
 is a kernel that sums ``spread`` over the neighbours of particle i, with m as the array w, and writes the function's
 result to c_new[i].
 
-Parameters are results of sums, values c_i of arrays c, the particle's number ``i``, its scene's number ``member``, the
-neighbourhood ``s``, and numbers and whole arrays that are passed to the launch. Any other parameter, such as
-``time_step``, is an array with one value for each scene. A result "+x_bar" is added to x_bar[i]. A result
+A parameter is the result of a sum, a value c_i of an array c, the particle's number ``i``, the scene's number
+``member``, or the neighbourhood ``s``. Numbers and whole arrays of a launch are also parameters. Any other parameter,
+such as ``time_step``, is an array with one value for each scene. A result "+x_bar" is added to x_bar[i]. A result
 "acceleration:acceleration_in" is added to acceleration_in[i], and the sum is written to acceleration[i].
 
 `sum_kernels` makes kernels that compute a multiple of a sum. `pointwise_kernels` lets Warp differentiate a function r =

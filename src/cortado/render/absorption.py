@@ -7,7 +7,7 @@ sample.
 The sample emits the light kappa ds P E(u), with E(u) = (1 - exp(-u)) / u. A layer of colour P / A emits the same light,
 but kappa ds P E(u) has no division by A.
 
-The transmittance in front of sample s is T_s, with T_0 = 1. For S samples the image is
+Light from sample s reaches the camera with the transmittance T_s, and T_0 is 1. For S samples the image is
 
     image = sum_s T_s kappa ds P_s E(u_s) + T_S background,    T_(s + 1) = T_s exp(-u_s).
 

@@ -253,7 +253,7 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 UP = {2: 2, 3: 1}
-"""Index of the upward axis by dimension. In 2-D the upward axis is perpendicular to the plane."""
+"""Index of the axis that points upwards, for each dimension. In 2-D the upward axis is perpendicular to the plane."""
 FINENESS = {2: 0.5, 3: 1.0}
 """Ratio of node distance to particle spacing, by dimension. With coarser nodes, optimisers can get stuck."""
 CLEARNESS = 8.0

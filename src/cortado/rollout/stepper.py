@@ -90,9 +90,8 @@ class AdjointGrowth:
     """The growth of the adjoint of states over successive calls of `Stepper.vjp`.
 
     Calls form a chain if the steps of each call end where the steps of the previous call began. The growth is the
-    smaller of two values: the growth of the norm over the whole chain, and the sum of the growths within each call. The
-    adjoints x^ of positions and v^ of velocities have the norm sqrt(|x^|^2 + |v^|^2 / T^2), where T is the duration of
-    the chain.
+    growth of the norm over the whole chain, or the sum of the growths within each call if smaller. The adjoints x^ of
+    positions and v^ of velocities have the norm sqrt(|x^|^2 + |v^|^2 / T^2), where T is the duration of the chain.
     """
 
     def __init__(self) -> None:
@@ -343,8 +342,8 @@ class Stepping:
     def step(self, state: DeviceState, parameters: Values | None = None, steps: int = 1) -> DeviceState: ...
 
     def step(self, state: Any, parameters: Values | None = None, steps: int = 1) -> Any:
-        """Return the state after ``steps`` steps from ``state``. The result is exactly the last state of ``run(steps,
-        parameters, state=state)``.
+        """Return the state after ``steps`` steps from ``state``. The new state is exactly the last state of
+        ``run(steps, parameters, state=state)``.
 
         For a batch, the result is a tuple with the state of each scene, and the state of a lost scene is NaN. For a
         `DeviceState`, the result is a `DeviceState`. ``parameters`` are any parameters of `Problem` except initial

@@ -118,7 +118,7 @@ def axes_of(axes: Any, is_carried: bool) -> Axes:
 
 def weights_of(q: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the weights w(q) = (1 - q)^4 (1 + 4 q), which are 0 for q > 1, and the derivatives w'(q) / q (Wendland
-    1995). q is the distance divided by the reach."""
+    1995). The argument q is the distance divided by the reach."""
     rest = np.clip(1.0 - q, 0.0, None)
     return rest**4 * (1.0 + 4.0 * q), -20.0 * rest**3
 

@@ -286,7 +286,7 @@ def require_same(former: Any, given: Any, folder: Path) -> None:
 
 
 def differences(one: Any, other: Any, missing: Any = None, name: str = "") -> dict[str, list[Any]]:
-    """Return pairs of different values by dotted name. ``missing`` replaces an absent value."""
+    """Return pairs of different values by dotted name. A name without a value has the value ``missing``."""
     are_lists = all(isinstance(own, list) and any(isinstance(e, Mapping) for e in own) for own in (one, other))
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         pairs = {key: (one.get(key, missing), other.get(key, missing)) for key in {**one, **other}}

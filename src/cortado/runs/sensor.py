@@ -249,8 +249,8 @@ class MeasuredColumn:
 
 
 def measured_beside(path: Path, readings: Mapping[str, Readings]) -> list[MeasuredColumn]:
-    """Pair the columns of a table with readings. A column "time" [s] and columns named as in sensors.csv are expected.
-    Units in brackets may be left out, and entries may be empty."""
+    """Pair the columns of a measured table with sensor readings. A column "time" [s] and columns named as in
+    sensors.csv are expected. Units in brackets may be left out, and entries may be empty."""
     columns = read_columns(path)
     named = {name_and_unit(head): values for head, values in columns.items()}
     times = named.get(("time", "s"), named.get(("time", None)))

@@ -7,10 +7,10 @@ momentum
 
     P = (q / dt) m D sum_j w_j n_j,   1 / m = 1 / M + r^2 / I,
 
-and gives the other solid the momentum -P. The formula has the stiffness q, the time step dt, the mass M of the body,
-the arm r of P, and the least moment of inertia I. If the other solid is free, 1 / m also includes 1 / M and r^2 / I of
-the other solid. A body in contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies have two contacts
-of the weight one half, because surface points of each body are inside the other body.
+and gives the other solid the momentum -P. Here q is the stiffness, dt the time step, M the mass of the body, r the arm
+of P, and I the least moment of inertia. If the other solid is free, 1 / m also includes 1 / M and r^2 / I of the other
+solid. A body in contact oscillates with the angular frequency sqrt(q) / dt. Two free bodies have two contacts of the
+weight one half, because surface points of each body are inside the other body.
 
 *Restitution*: The product of beta - 1 and the growth of D in the step is added to D. The factor beta is a function of
 the coefficient of restitution e. The function beta(e) is fitted to simulated impacts on a wall, so that a body rebounds

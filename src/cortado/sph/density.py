@@ -2,7 +2,8 @@
 
 `docs/discretisation.md` has the equation of the number density. The density is the number density times the mass of the
 particle divided by its rest volume. Masses of neighbours do not enter the sum, so that the density of a heavy fluid
-does not smear into a light fluid. The pressure of a particle pushes walls along the sum of the walls' kernel gradients.
+does not smear into a light fluid. The pressure of a particle pushes walls in the direction of the sum of the walls'
+kernel gradients.
 """
 
 from functools import cache, cached_property, partial

@@ -4,9 +4,8 @@
 opening. Particles further upstream than the length of the emitted column wait in reserve at separate places, without
 derivative.
 
-A nozzle fed by drains emits removed particles again. When the column has room for another layer at its upstream end,
-removed particles form the new layer, with the same offsets as the first particles. The choice of removed particles has
-no derivative.
+A nozzle fed by drains emits removed particles again. When the column has room for a layer at its upstream end, removed
+particles form this layer, with the offsets of the first particles. The choice of removed particles has no derivative.
 """
 
 from dataclasses import dataclass

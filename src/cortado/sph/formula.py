@@ -1,8 +1,8 @@
 """User-defined Python functions in kernels, compiled by Warp in float32 or float64, with derivatives.
 
 Numbers, vectors and times among the parameters of a function are stored in one vector. Array parameters, such as the
-weights of a neural network, are stored together in one array (members, numbers). The adjoint of the array parameters
-needs no atomic operations: each thread adds to a separate row, and the rows are summed in a fixed order.
+weights of a neural network, are stored together in one array (members, numbers). Without atomic operations, each thread
+adds adjoints of array parameters to a separate row, and the rows are summed in a fixed order.
 """
 
 import ast

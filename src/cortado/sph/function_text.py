@@ -76,7 +76,7 @@ def definition(what: str, function: FunctionType, source: str) -> ast.FunctionDe
         if found.name == function.__code__.co_name and _same(_compiled(found, function.__code__), function.__code__):
             return found
     raise InputError(
-        f"the source code of {what} in {function.__code__.co_filename} differs from the code that Python runs, as "
+        f"the source code of {what} in {function.__code__.co_filename} differs from the code that runs, as "
         "the file or the function has changed since the import: import the function again."
     )
 

@@ -42,8 +42,8 @@ class StepContext:
     """The current step, with all arrays that its parts may read.
 
     Kernels find arguments in the context by name: the fields of the particles and the parameters. Kernels also find the
-    neighbourhood ``s``, ``order`` (from sorted to scene order), the number ``step`` (members,) of the step, and the
-    volume ``cell`` of a particle [m^d]. In a batch particle i belongs to scene i // ``particles``.
+    neighbourhood ``s``, the ``order`` of particles, the number ``step`` (members,) of the step, and the volume ``cell``
+    of a particle [m^d]. In a batch particle i belongs to scene i // ``particles``.
     """
 
     launcher: KernelLauncher

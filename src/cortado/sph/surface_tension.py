@@ -198,8 +198,8 @@ def force(setting: Setting) -> Force:
         viscosity = 0.0 if scene.forces.viscosity == "none" else phase.viscosity
         if viscosity < least:
             warn(
-                f"the viscosity of phase {phase.name!r} is {viscosity:g} Pa s, but for this amount of fluid with a "
-                f"surface tension of {tension:g} N/m should be at least {least:.2g} Pa s: with a lower viscosity the "
+                f"the viscosity of phase {phase.name!r} is {viscosity:g} Pa s, but should be at least "
+                f"{least:.2g} Pa s for this amount of fluid and a surface tension of {tension:g} N/m: otherwise the "
                 "surface gains energy and throws out particles."
             )
     if form == "curvature":

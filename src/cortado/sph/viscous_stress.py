@@ -7,9 +7,9 @@ from the start of the step. The acceleration a' at the end of a step solves
     a' = a + g(v + dt a'),   that is   B (a' - a) = g(v + dt a),   B y = y - dt g(y).
 
 `cortado.sph.viscous_solve` solves this equation to round-off. The operator B is symmetric and positive in the product
-sum_i m_i a_i . b_i. The viscosity mu belongs to the velocities v at the start of the step, and the stress to u = v + dt
-a' at its end. Derivatives are exact for the solved equation: the tangent and the adjoint each need one more solve with
-B.
+sum_i m_i a_i . b_i. The viscosity mu follows from the velocities v at the start of the step. The stress follows from
+the velocities u = v + dt a' at the end. Derivatives are exact for the solved equation: the tangent and the adjoint each
+need one more solve with B.
 """
 
 from collections.abc import Sequence
