@@ -294,7 +294,7 @@ class Extrapolation:
     error: float | None
     """Estimated error of the value at the finest size, including a safety factor. None if a value is NaN."""
     flag: str = ""
-    """Reason why the order is missing or not trusted. Empty if the order is trusted."""
+    """Reason why the order is missing or not trusted. The text is empty if the order is trusted."""
 
     @classmethod
     def of(cls, sizes: Sequence[float], values: Sequence[float]) -> "Extrapolation":

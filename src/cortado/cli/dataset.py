@@ -39,7 +39,7 @@ class Member:
         return load_scene(self.file, overrides).lasting(steps=self.table.steps)
 
     def __call__(self, number: int) -> tuple[bool, list[str]]:
-        """Compute and write a run. Return whether it succeeded, and its warnings."""
+        """Compute and write a run. Return whether the run succeeded, and the run's warnings."""
         require_shared(self.out, "the scene and the folder of a data set")
         folder = datasets.DatasetFolder(self.out)
         with warnings.catch_warnings(record=True) as caught, untracked():

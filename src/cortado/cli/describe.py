@@ -70,9 +70,9 @@ class RunLength:
         solver, picture = simulation.scene.solver, simulation.scene.picture or Picture()
         self.is_about = solver.chooses and time is not None
         self.steps = steps_of_run(simulation, steps, time, {}) // (ROOM if self.is_about else 1)
-        """Number of steps. An estimate if the solver chooses the time steps of a run until a given time."""
+        """Number of steps. The number is an estimate if the solver chooses the steps of a timed run."""
         self.time = time = time if solver.chooses else self.steps * float(solver.time_step)
-        """Simulated time [s]. None for a given number of steps whose lengths the solver chooses."""
+        """Simulated time [s]. The time is None for a given number of steps whose lengths the solver chooses."""
         self.frames = frames = choice.count(self.steps, time)
         """Number of recorded frames, including the first and last state, or None if it is unknown."""
         self.trajectory: float | None = None
@@ -190,7 +190,7 @@ def of_emitter(emitter: EmitterTable, spacing: float) -> dict[str, Any]:
 
 
 def seconds_of_picture(simulation: Simulation, quality: str) -> float | None:
-    """Measure the time to draw the initial state on all cores [s]. Returns None if no fluid is visible."""
+    """Measure the time to draw the initial state on all cores [s]. Returns None if the picture shows no fluid."""
     scene, positions = simulation.scene, simulation.positions[: simulation.free_particles or None]
     scene = scene.model_copy(update={"picture": (scene.picture or Picture()).model_copy(update={"quality": quality})})
     colours = colours_of(scene, simulation.mass_fractions, simulation.particles)[: len(positions)]

@@ -43,7 +43,7 @@ class Verdict:
     reduction: float
     """First loss divided by the best loss, or infinity if the best loss is 0."""
     errors: dict[str, float]
-    """Relative L2 error of each parameter's estimate. The error is absolute where the true value is 0."""
+    """Relative L2 error of each parameter's estimate. If the true value is 0, the error is absolute."""
     psnr: float | None
     """Peak signal-to-noise ratio of the last image [dB], or None for a task without images."""
     failures: list[str]
@@ -52,8 +52,8 @@ class Verdict:
 def judge(
     task: Task, result: Result, estimate: Arrays | None = None, noise: float | None = None, first: float | None = None
 ) -> Verdict:
-    """``estimate`` has the found parameters, if ``result`` does not have them. ``noise`` is the peak signal-to-noise
-    ratio of the last image [dB]. ``first`` is the initial loss, for a history that starts later."""
+    """``estimate`` contains the found parameters if ``result`` does not contain parameters. ``noise`` is the peak
+    signal-to-noise ratio of the last image [dB]. ``first`` is the initial loss, for a history that starts later."""
     check, estimate = task.optimise.check, result.parameters if estimate is None else estimate
     first = result.history[0].loss if first is None else first
     reduction = first / result.loss if result.loss > 0.0 else math.inf

@@ -38,7 +38,7 @@ from cortado.solvers.particles import ParticleSolver
 
 @dataclass(frozen=True)
 class Energy:
-    """Energies of the fluid [J], in 2-D of a layer 1 m thick. Particles in emitters and drains are left out."""
+    """Energies of the fluid [J], in 2-D of a layer 1 m thick. Particles in emitters and drains do not count."""
 
     kinetic: float
     potential: float
@@ -76,7 +76,7 @@ class RunSummary:
         self.first = Energy.of(simulation, rollout, rollout.initial, 0)
         self.last = Energy.of(simulation, rollout, last, taken - 1)
         self.turned = bool(np.ptp(gravity[0, :taken], axis=0).any())
-        """True if gravity changed during the run. The first and last potential energies are then not comparable."""
+        """True if gravity changed during the run. Potential energies before and after a change are not comparable."""
         self.densities: tuple[float, float] | None = None
         """Least and greatest density of the last state [kg/m3], or None for solvers without particles."""
         if isinstance(solver, ParticleSolver):

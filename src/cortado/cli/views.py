@@ -42,7 +42,7 @@ Quantity = Callable[[], np.ndarray]
 
 
 class Window:
-    """A window in the browser, served by viser. The y axis points up."""
+    """A window in the browser, served by viser. In the window, the y axis points up."""
 
     def __init__(self, scene: Scene, port: int, units: Mapping[str, str]):
         """Open a window. ``units`` maps the names of particle quantities to their units."""
@@ -138,7 +138,7 @@ class Window:
         return self._space(solid.position), np.roll(turn, 1)
 
     def look_at(self, positions: Points) -> None:
-        """Point the camera at the container and the solids. Without them, point it at ``positions`` (n, d) [m]."""
+        """Point the camera at the container and the solids. Without both, point it at ``positions`` (n, d) [m]."""
         lines = self._space(outline(self.scene)).reshape(-1, 3)
         points = lines if len(lines) else self._space(positions)
         lower, upper = points.min(axis=0), points.max(axis=0)

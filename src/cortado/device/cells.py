@@ -133,7 +133,7 @@ class CellSort:
         self.grid.starts = wp.zeros(cells + 1, dtype=wp.int32, device=device)
 
     def __call__(self, positions: wp.array) -> None:
-        """Sort positions (members * n,) [m] by cell into `order`. The sort is stable."""
+        """Sort positions (members * n,) [m] by cell into `order`. The sort keeps the order of particles in a cell."""
         if self._all == 0:
             return
         seen = (positions, self.order, self.grid.starts)

@@ -145,7 +145,8 @@ def launch_together(name: str, threads: int, arguments: Sequence[Any], work: Cal
 
 class KernelLauncher:
     """On a CPU, the cores share the launch of a kernel with the neighbourhood argument ``s``. Each launch covers a
-    range of particles, and the kernel computes particle ``s.first + wp.tid()``. Results do not depend on the cores."""
+    range of particles, and the kernel computes particle ``s.first + wp.tid()``. The number of cores does not change
+    results."""
 
     def __init__(self, particles: int, device: Any, record_tape: bool):
         self.particles, self.device, self._record_tape = particles, device, record_tape
@@ -259,7 +260,7 @@ class BandLauncher:
         in_parallel(work, left, cores)
 
     def to_and_fro(self, kernel: wp.Kernel, rounds: int, values: wp.array, other: wp.array, **given: Any) -> wp.array:
-        """Launch a kernel ``rounds`` times, swapping its input and output each time. Return the last output."""
+        """Launch a kernel ``rounds`` times, swapping its input and output each time. Return the final output."""
         count, both = len(values), ({"values": values, "found": other}, {"values": other, "found": values})
         if self.device.is_cpu and count > LEAST_SHARED_OFTEN:
             ways: list[Callable[[], None]] = [partial(self, kernel, count, **given, **one) for one in both]
@@ -290,7 +291,7 @@ class HostCopy:
             wp.copy(self._copy, self._array)
 
     def read(self, rows: int | None = None) -> np.ndarray:
-        """Wait for the device. The next call overwrites the result."""
+        """Wait until the device has finished the copy. The next call overwrites the result."""
         if not (self._is_cpu or self.is_fetched or rows == 0):
             self.fetch()
             wp.synchronize_stream(self._array.device)

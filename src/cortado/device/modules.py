@@ -32,7 +32,7 @@ from cortado.errors import ComputationError, InputError, shown
 from cortado.files.terminal import note, say, timed_note
 
 SHALLOW, DEEP = "-slp-recursion-max-depth=4", "-slp-recursion-max-depth=7"
-"""LLVM options for the search depth of vectorisation: Warp's default and Cortado's value."""
+"""LLVM options for the search depth of vectorisation: Warp's default option, and Cortado's option."""
 UNUSED = "-DWP_NO_BFLOAT16="
 
 

@@ -34,7 +34,8 @@ class Precision:
     tiny: float
     """Very small positive number with a finite reciprocal."""
     furthest: float
-    """Greatest distance of positions from the origin [spacings]. Rounding is then at most about 0.001 spacings."""
+    """Greatest distance of positions from the origin [spacings]. Positions are then rounded by about 0.001 spacings at
+    most."""
     greatest: float
     """Greatest size of a parameter, which keeps products of several parameters finite."""
 
@@ -87,7 +88,7 @@ class TypesByName:
     """
 
     def __init__(self, usual: Any, *names: Mapping[Any, str]):
-        """``names`` map types to the names of parameters. Later mappings have priority."""
+        """``names`` map types to the names of parameters. Later mappings in ``names`` have priority."""
         self._usual = usual
         self._types = {name: kind for own in names for kind, words in own.items() for name in words.split()}
 

@@ -33,7 +33,7 @@ CORES = "CORTADO_CORES"
 
 
 def usable_cores() -> int:
-    """The environment variable CORTADO_CORES limits the number."""
+    """The environment variable CORTADO_CORES limits the number of cores."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get(CORES, "").strip()
     if not limit:
@@ -218,7 +218,7 @@ class Answer:
 
 
 def pickled(value: Any, what: str) -> bytes:
-    """The result contains code of the main module. The message of an `InputError` begins with ``what``."""
+    """The pickled result contains code of the main module. The message of an `InputError` begins with ``what``."""
     import cloudpickle
 
     try:
@@ -363,7 +363,7 @@ def within(budget: float, device: Any = None) -> int:
 
 
 def available(device: Any = None) -> float:
-    """Return the free memory of a Warp device or of this process [bytes]. Memory of unknown size counts as infinite."""
+    """Return the free memory of a Warp device or of this process [bytes]. Unknown free memory counts as infinite."""
     if device is not None and not device.is_cpu:
         return float(device.free_memory)
     found = [float(psutil.virtual_memory().available)]

@@ -274,7 +274,7 @@ class Mesh(Solid):
         return self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
 
     def distance(self, points: Points) -> Points:
-        """Where parts overlap, the depth is underestimated."""
+        """Where parts overlap, the returned depth is too small."""
         return self._looked_up(points, np.inf)[1]
 
     def distance_up_to(self, points: Points, reach: float) -> Points:

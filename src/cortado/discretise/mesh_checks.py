@@ -196,7 +196,7 @@ def parts_of(
 
 
 def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
-    """The owner of a cavity is the smallest body around the cavity. Any other body is its own owner."""
+    """The owner of a cavity is the smallest body around the cavity. Any other body owns itself."""
     owners = np.arange(len(volumes))
     for cavity in np.flatnonzero(volumes < 0.0):
         holds = (around[:, seen == cavity] > 0).all(axis=1) & (volumes > -volumes[cavity])
@@ -207,7 +207,7 @@ def _owners(volumes: Points, around: Numbers, seen: Numbers) -> Numbers:
 
 
 def _apart(met: np.ndarray, sizes: list[int]) -> list[list[int]]:
-    """Divide indices into few groups. ``met`` is False for any two indices in a group."""
+    """Divide indices into a small number of groups. ``met`` is False for any two indices in a group."""
     groups: list[list[int]] = []
     for number in sorted(range(len(sizes)), key=lambda one: -sizes[one]):
         free = next((group for group in groups if not met[number, group].any()), None)
@@ -284,8 +284,8 @@ def _solid_parts(
     wrong = tree.windings(beside) < 0
     if wrong.all():
         raise InputError(
-            f"The normals of {what} point inwards, so that fluid would fill the solid: turn all of its triangles over, "
-            "as trimesh's mesh.invert() does."
+            f"The normals of {what} point inwards, so that inside and outside are exchanged: turn all of its triangles "
+            "over, as trimesh's mesh.invert() does."
         )
     if wrong.any():
         all_bodies, count = len(np.unique(labels)), len(np.unique(labels[some][wrong]))

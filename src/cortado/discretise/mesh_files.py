@@ -24,7 +24,7 @@ SHARE = 0.01
 ALONG = 0.9
 """Least cosine between the normals of opposite surfaces of a sheet, with one normal reversed."""
 TOO_LARGE = 100.0
-"""Relative size above which a mesh seems to be in a wrong unit. The scale is the container or 100 spacings."""
+"""Relative size above which a mesh seems to be in a wrong unit. The reference size is the container or 100 spacings."""
 PROBES, STEPS, HALVINGS = 20_000, 16, 12
 """Numbers of surface points, of steps for each point, and of bisections of the last step, in measuring thickness."""
 BEYOND = 1e-3
@@ -69,7 +69,7 @@ def mesh_in_file(path: str) -> FoundMesh:
 
 
 def triangles_in_file(path: str) -> tuple[Points, Numbers]:
-    """The surface may be open. Vertices (m, 3) are in the file's unit."""
+    """The surface in the file may be open. Vertices (m, 3) are in the file's unit."""
     vertices, triangles, _ = read_triangles(path)
     if not np.isfinite(vertices).all():
         raise InputError(f"{path!r} has a vertex that is not finite: export the mesh once more.")

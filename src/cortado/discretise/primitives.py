@@ -232,7 +232,7 @@ def box_faces(half: Points) -> Faces:
 
 
 def cut_box_faces(lower: Points, upper: Points, normal: Points, height: float) -> Faces:
-    """The part of the box below the plane remains. ``height`` [m] is along the unit vector ``normal`` (d,)."""
+    """The part of a box below the plane remains. ``height`` [m] is along the unit vector ``normal`` (d,)."""
     from scipy.spatial import ConvexHull
 
     ends = corners_of(lower, upper)
@@ -266,7 +266,7 @@ def arc(centre: Points, radius: float, start: float, end: float, fine: float) ->
 
 
 def revolved_faces(profile: Faces, axis: int, fine: float) -> Faces:
-    """The profile is symmetric about the axis. Faces are about ``fine`` [m] wide."""
+    """The given profile is symmetric about the axis. Faces are about ``fine`` [m] wide."""
     count = max(int(np.ceil(2.0 * np.pi * profile.vertices[:, 0].max() / fine)), 12)
     angles = 2.0 * np.pi * np.arange(count) / count
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)

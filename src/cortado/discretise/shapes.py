@@ -116,7 +116,7 @@ def lattice(counts: Points, spacing: float) -> Points:
 
 
 def disc(radius: float, spacing: float, dimension: int) -> Points:
-    """With ``dimension`` 1 the disc is a line segment. There is at least one point."""
+    """With ``dimension`` 1 the disc is a line segment. The disc has at least one point."""
     points = lattice(np.full(dimension, np.maximum(whole_cells(np.array(2.0 * radius), spacing), 1.0)), spacing)
     return points[np.linalg.norm(points, axis=1) <= radius]
 
@@ -132,7 +132,7 @@ def across(direction: ArrayLike) -> Points:
 
 
 def whole_origin(points: Points) -> Points:
-    """Return an origin near distant points, or 0. The subtraction of the origin is exact."""
+    """Return an origin near distant points, or 0. Subtracting the origin from the points is exact."""
     lower, upper = points.min(axis=0), points.max(axis=0)
     step = 2.0 ** np.ceil(np.log2(max((upper - lower).max(), np.finfo(np.float64).tiny)))
     return np.asarray(step * np.round((0.5 * lower + 0.5 * upper) / step))

@@ -123,7 +123,7 @@ def pressure_stiffness(kernel: SmoothingKernel, spacing: float, support: float, 
 
 @cache
 def greatest_rate(kernel: SmoothingKernel, spacing: float, support: float, dimension: int) -> float:
-    """Return the overcorrection of a pressure iteration for the worst wave. Iterations converge below a value of 2."""
+    """Return the overcorrection of a pressure iteration for the worst wave. Iterations converge for values below 2."""
     offsets = lattice_offsets(spacing, support, dimension)
     gradients = kernel.gradient(offsets, support)
     answers = np.sin(_waves(spacing, dimension) @ offsets.T) @ gradients

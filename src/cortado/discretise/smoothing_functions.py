@@ -97,8 +97,8 @@ RADIAL_FUNCTIONS = {
 @cache
 def smoothing_functions(kernel: SmoothingKernel, precision: Precision, taped: bool = False) -> SimpleNamespace:
     """The functions take a separation x [m], the inverse support radius [1/m] and the normalisation [1 / m^d].
-    ``slope`` is the factor a in the kernel's gradient a x. ``slope_change`` is the derivative of a along a vector u. A
-    tape can differentiate ``taped`` functions."""
+    ``slope`` is the factor a in the kernel's gradient a x. ``slope_change`` is the derivative of a along a vector u.
+    Warp's tape can differentiate ``taped`` functions."""
     real, vector = precision.real, precision.vector
     value, gradient_factor, hessian_factor = RADIAL_FUNCTIONS[kernel.name](precision)
     functions = arithmetic(precision, taped)

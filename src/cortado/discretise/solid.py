@@ -193,7 +193,7 @@ class Mass:
     volume: float
     """Volume [m^d]."""
     inertia: Points
-    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only the part about z is not 0."""
+    """Inertia tensor about the centroid for density 1 (3, 3) [m^(d + 2)]. In 2-D only component zz is not 0."""
 
     @classmethod
     def of(cls, solid: Solid) -> "Mass":

@@ -82,7 +82,7 @@ def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoi
 
 
 def surface_feet(solid: Solid, fine: float, is_near: Near | None = None) -> tuple[Points, Points]:
-    """Return surface points (n, d) [m] and outward unit vectors. Points that fail ``is_near`` may be left out."""
+    """Return surface points (n, d) [m] and outward unit vectors. The result may lack points that fail ``is_near``."""
     found = solid.own_feet(fine)
     if found is not None:
         return found

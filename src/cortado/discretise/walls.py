@@ -139,8 +139,8 @@ def short_box(
 
 
 SHALLOW = 0.4
-"""Depth of the shallow layer of wall particles [spacings]. It exists only if the second fluid layer's kernel reaches
-the wall."""
+"""Depth of the shallow layer of wall particles [spacings]. The layer exists only if the second fluid layer's kernel
+reaches the wall."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class RestLattice:
     @cached_property
     def layers(self) -> WallLayers:
         """Layers of wall particles at a flat wall. The first layer of fluid is half a spacing from the wall. The layers
-        meet two conditions:
+        of wall particles meet two conditions:
 
         - The first and second layer of fluid have the rest density. Band et al. (2018) scale volumes for this purpose.
         - A uniform pressure pushes no particle of the first layer. The wall's density contribution is steep enough to

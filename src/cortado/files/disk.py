@@ -96,7 +96,7 @@ MOST_BYTES = 2**28
 
 
 def read_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. An empty cell is NaN."""
+    """Return the columns of a CSV table as arrays (lines,), by the names in the first line. Empty cells become NaN."""
     try:
         text = content(path, MOST_BYTES).decode("utf-8-sig")
         lines = [line for line in csv.reader(io.StringIO(text)) if any(entry.strip() for entry in line)]
@@ -170,7 +170,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """A broken link counts as existing."""
+    """A broken link counts as an existing file."""
     with sentences(path):
         try:
             path.lstat()

@@ -85,7 +85,7 @@ def png(image: ArrayLike) -> bytes:
 
 class ShadedPicture(np.ndarray):
     """A linear picture (rows, columns, 3) with values from 0 to 1. Notebooks show this NumPy array as a picture. Use
-    `cortado.pictures.write_picture` to save it."""
+    `cortado.pictures.write_picture` to save the picture."""
 
     @classmethod
     def of(cls, image: ArrayLike) -> Self:

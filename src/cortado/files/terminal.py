@@ -75,7 +75,7 @@ def tell(result: str) -> None:
 
 @contextmanager
 def to_stdout() -> Iterator[None]:
-    """A closed pipe raises `BrokenPipeError`. Any other error of printing raises `ComputationError`."""
+    """A closed pipe raises `BrokenPipeError`. Any other error in printing raises `ComputationError`."""
     try:
         try:
             yield

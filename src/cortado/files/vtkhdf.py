@@ -201,7 +201,7 @@ class Pages(io.RawIOBase):
         self._place = self._end = 0
 
     def save(self, file: Any) -> None:
-        """The file remains sparse."""
+        """The file on disk remains sparse."""
         file.truncate(self._end)
         for number, page in sorted(self._pages.items()):
             file.seek(number * _PAGE)
@@ -243,8 +243,8 @@ class TrajectoryWriter:
     frames, and can be opened while it grows. Frames that are not written yet have no particles."""
 
     def __init__(self, path: str | Path, *, expected: int | None = None, kept: int = 1, **fields: Any) -> None:
-        """``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames. By default it must
-        have room for all frames."""
+        """``fields`` are arguments of `FileLayout`. The disk must have room for ``expected`` frames. By default the
+        disk must have room for all frames."""
         self.path, self._layout = Path(path), FileLayout(**fields)
         self.frames_written, self.steps_written, self._kept = 0, 0, kept
         self._unfinished = unfinished(self.path)

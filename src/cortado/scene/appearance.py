@@ -238,8 +238,8 @@ Place = Annotated[tuple[Length, ...], components("x", "y", "z")]
 
 
 class Picture(Table):
-    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Keys that are left out get
-    suitable values."""
+    """Settings for the shaded pictures and films of `cortado run`, `optimise` and `picture`. Missing keys get suitable
+    values."""
 
     width: Annotated[int, count(64, 7680)] = 1280
     """Width of the picture in pixels."""

@@ -41,7 +41,7 @@ class Knots:
     spline with zero slope at both ends. The curve is constant before the first and after the last time.
 
     A ramp makes the curve start smoothly from the value ``begun``. The difference between curve and ``begun`` is
-    multiplied by 10 s³ - 15 s⁴ + 6 s⁵. Here s = min(t / ramp, 1), and t is the time.
+    multiplied by 10 s³ - 15 s⁴ + 6 s⁵. In this formula, t is the time, and s = min(t / ramp, 1).
     """
 
     times: NDArray[np.float64]

@@ -20,7 +20,7 @@ the outer shell."""
 
 
 class BoxDrain(Ordered):
-    """A box that removes every particle inside."""
+    """A drain that removes every particle inside a box."""
 
     shape: Literal["box"]
     """Kind of the drain."""
@@ -47,7 +47,7 @@ class BoxDrain(Ordered):
 
 
 class PlaneDrain(Table):
-    """A plane that removes particles. A particle is removed when it crosses the plane along `direction`."""
+    """A drain that removes particles at a plane. A particle is removed when it crosses the plane along `direction`."""
 
     shape: Literal["plane"]
     """Kind of the drain."""
@@ -79,8 +79,8 @@ class FlowTable(Table):
     flow_rates: tuple[Annotated[float, quantity("m3/s (m2/s in 2-D)", ge=0.0)], ...] | None = None
     """(k,) Flow rates at `times`, in place of `flow_rate` [m3/s (m2/s in 2-D)]."""
     file: File | None = None
-    """CSV file in place of `times` and `flow_rates`. Its header has the columns `time` and `flow_rate` with units. A
-    relative path starts at the scene file's folder."""
+    """CSV file in place of `times` and `flow_rates`. The file's header names the columns `time` and `flow_rate` with
+    units. A relative path starts at the scene file's folder."""
 
     def in_dimension(self, dimension: int, path: FieldPath = ()) -> Self:
         if self.file is not None:

@@ -78,7 +78,7 @@ class EmitterTable(FluidBody, FlowTable):
     speed."""
 
     name: Text = "nozzle"
-    """Name of the emitter. The names of its parameters begin with this name."""
+    """Name of the emitter. Names of the emitter's parameters begin with the emitter's name."""
     outlet: Vector[Length]
     """(d,) Position of the middle of the opening [m]."""
     direction: Direction = (0.0, -1.0, 0.0)
@@ -95,14 +95,13 @@ class EmitterTable(FluidBody, FlowTable):
     """Total volume that the emitter emits [m3], in 2-D area [m2]. If left out, commands such as ``cortado run`` provide
     enough fluid for the run, but `Simulation` provides only the column behind the opening (see `Scene.lasting`)."""
     fed_by: tuple[Text, ...] = ()
-    """Names of drains. The emitter emits the particles that these drains remove. Besides the particles from drains, the
-    emitter has only the waiting column and `volume`. A drain can feed only one emitter."""
+    """Names of drains. The emitter emits the particles that the listed drains remove. Besides the particles from
+    drains, the emitter has only the waiting column and `volume`. A drain can feed only one emitter."""
     path: OutletPath | None = None
     """Position of the middle of the opening over time; if left out, the opening stays at `outlet`."""
     jitter: Annotated[float, quantity(ge=0.0, le=0.3)] = 0.0
-    """Largest random offset of a particle from its lattice position, along each axis of the opening, in spacings. The
-    offsets are equal in all runs. The default in "projection" is 0.05, because a stream on an exact lattice is too
-    wide."""
+    """Largest random offset of a particle from its lattice position, along each axis of the opening, in spacings. All
+    runs have equal offsets. The default in "projection" is 0.05, because a stream on an exact lattice is too wide."""
 
     @field_validator("direction")
     @classmethod
@@ -139,7 +138,7 @@ class EmitterTable(FluidBody, FlowTable):
         return math.inf if self.fed_by else self.time_for(self.supply(spacing) * spacing * self.area(spacing))
 
     def lasting(self, time: float, spacing: float) -> Self:
-        """Return the table with enough fluid until ``time`` [s]. A given ``volume`` stays unchanged."""
+        """Return the table with enough fluid until ``time`` [s]. A ``volume`` in the table stays unchanged."""
         if self.volume is not None or self.dry_after(spacing) >= time:
             return self
         column = self.layers(spacing) * spacing * self.area(spacing)

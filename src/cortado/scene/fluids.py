@@ -43,8 +43,8 @@ class Fluid(FluidBody):
     velocity: Vector[Annotated[float, quantity("m/s")]] = (0.0, 0.0, 0.0)
     """(d,) Initial velocity [m/s]."""
     angular_velocity: Turns[Annotated[float, quantity("rad/s")]] = None
-    """Initial angular velocity about the middle of the body [rad/s]; no rotation if left out. In 3-D a vector, in 2-D
-    one number, positive counterclockwise."""
+    """Initial angular velocity about the middle of the body [rad/s]; no rotation if left out. The value is a vector in
+    3-D, and one number in 2-D, positive counterclockwise."""
 
     def velocities(self, points: Points) -> Points:
         found = np.tile(np.array(self.velocity, dtype=np.float64), (len(points), 1))
@@ -94,8 +94,8 @@ class RegionFluid(Fluid):
 
     @abstractmethod
     def distance(self, points: Points, spacing: float, reach: float = np.inf) -> Points:
-        """Return signed distances (n,) [m] of points (n, d) [m] from the fluid, negative inside. Distances greater than
-        ``reach`` [m] are only lower bounds."""
+        """Return signed distances (n,) [m] of points (n, d) [m] from the fluid, negative inside. Returned distances
+        greater than ``reach`` [m] are only lower bounds."""
 
     def cuts_cells(self, spacing: float) -> bool:
         return False
@@ -109,16 +109,16 @@ class Turnable(RegionFluid):
     """Base of bodies of fluid that may be rotated. The particles of a rotated body are packed."""
 
     rotation: Turns[Angle] = None
-    """Rotation about the middle of the body [rad]; no rotation if left out. In 3-D a rotation vector, in 2-D one
-    number, positive counterclockwise."""
+    """Rotation about the middle of the body [rad]; no rotation if left out. The value is a rotation vector in 3-D, and
+    one number in 2-D, positive counterclockwise."""
 
 
 class BoxFluid(BoxShape, Turnable):
     """A box of fluid. Particles are at ``lower + (i + 1/2) spacing``. In a rotated box, particles are packed.
 
-    If a side is no multiple of the spacing, the lattice is stretched or compressed by up to 3 %. The mass is then right
-    within 0.3 %. If no such lattice fits, the particles are packed, and the mass is up to 0.8 % too small. `describe`
-    and a run then print the prescribed and the actual mass.
+    If a side is no multiple of the spacing, the lattice is stretched or compressed by up to 3 %. The mass of the
+    stretched lattice is right within 0.3 %. If no such lattice fits, the particles are packed, and the mass is up to
+    0.8 % too small. `describe` and a run then print the prescribed and the actual mass.
     """
 
     def block(self, spacing: float) -> Block:

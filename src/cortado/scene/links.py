@@ -51,8 +51,8 @@ class HingeTable(Table):
     speed: Annotated[float, quantity("rad/s")] | None = None
     """Target angular velocity of the motor [rad/s]. The damping drives the body towards this angular velocity."""
     times: tuple[Annotated[float, quantity("s", ge=0.0)], ...] | None = None
-    """(k,) Times of `torques` or `speeds`, increasing from 0 [s]. Values are interpolated linearly between the
-    times."""
+    """(k,) Times of `torques` or `speeds`, increasing from 0 [s]. Torques and speeds are interpolated linearly between
+    the times."""
     torques: tuple[Annotated[float, quantity("N m")], ...] | None = None
     """(k,) Torques of the motor at `times`, in place of `torque` [N m]."""
     speeds: tuple[Annotated[float, quantity("rad/s")], ...] | None = None
@@ -244,7 +244,7 @@ class SpringTable(Table):
     """A spring with a damper between a free body and a second solid or a point in space."""
 
     name: Text
-    """Name of the spring. The names of its parameters begin with this name."""
+    """Name of the spring. Names of the spring's parameters begin with the spring's name."""
     solid: Text
     """Name of the free body."""
     point: Vector[Length]

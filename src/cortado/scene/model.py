@@ -182,9 +182,9 @@ class FixedForces(Table):
     """(d,) Gravitational acceleration [m/s2]. If schedule.gravity is given, it must begin with this vector."""
     viscosity: Literal["stress", "pairwise", "none"] = "stress"
     """Form of the viscous force: "stress" or "pairwise", or "none" for no force. The form "stress" is accurate within 1
-    % for a shear wave with 40 particles per wavelength. It exerts no force on fluid in rigid rotation. The form
-    "pairwise" (Monaghan 2005) exists only for the solver "pcisph". The effective viscosity of "pairwise" is 0.6 to 1.4
-    times the given viscosity, depending on the direction of the shear."""
+    % for a shear wave with 40 particles per wavelength. The form "stress" exerts no force on fluid in rigid rotation.
+    The form "pairwise" (Monaghan 2005) exists only for the solver "pcisph". The effective viscosity of "pairwise" is
+    0.6 to 1.4 times the given viscosity, depending on the direction of the shear."""
     viscous_solve: Literal["automatic", "explicit", "implicit"] = "automatic"
     """Time integration of the viscous stress. Explicit integration limits the time step. Implicit integration solves a
     system of equations in each step, and works with any time step. The value "automatic" means implicit if the time

@@ -159,7 +159,7 @@ def solid_frames(scene: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def greatest_speed(solids: Sequence[SolidTable], values: Mapping[str, Any]) -> float:
-    """Return the greatest speed of any point on the solids [m/s]. ``values`` replace parameters of the scene."""
+    """Return the greatest speed of any point on the solids [m/s]. ``values`` replace the scene's parameters."""
     found = [0.0]
     for solid in moving(solids):
         shifts, turns = courses(solid)

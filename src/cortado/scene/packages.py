@@ -44,8 +44,8 @@ def guarded(
 ) -> Iterator[None]:
     """Convert an exception in a package to an ``error`` whose message begins with ``what``.
 
-    Errors of Cortado, keyboard interrupts and ``expected`` exceptions pass unchanged. An attempt to end the process is
-    converted too.
+    Errors of Cortado, keyboard interrupts and ``expected`` exceptions pass unchanged. A package's attempt to end the
+    process is converted too.
     """
     kept: tuple[type[BaseException], ...] = (CortadoError, KeyboardInterrupt, *expected)
     try:
@@ -57,7 +57,7 @@ def guarded(
 
 
 class PackageMaker:
-    """A solver or force of an installed package. Error messages name the package."""
+    """A solver or force of an installed package. Error messages contain the package's name."""
 
     def __init__(self, part: Any, kind: str, package: str):
         self._part, self._kind, self._package = part, kind, package
@@ -141,7 +141,7 @@ TYPES = {float: Annotated[float, quantity()], int: Annotated[int, count(-MOST, M
 
 
 def registered(group: str, kind: str, own: Collection[str], advice: str) -> EntryPoint:
-    """Return the entry point ``kind`` in a group such as "cortado.forces". ``own`` are names that Cortado uses."""
+    """Return the entry point ``kind`` in a group such as "cortado.forces". The names in ``own`` belong to Cortado."""
     if kind in own:
         raise SceneError(None, "kind", kind, f"another name, as {kind} is a force of Cortado's own, in [forces]")
     found = entry_points(group=group)

@@ -35,7 +35,7 @@ def reference_density_adjoint(
 
 
 SMALL = 1e-2
-"""Smallest angle by which a formula divides [rad]. Smaller angles use a series."""
+"""Smallest angle by which a formula divides [rad]. For smaller angles, the formula is a series."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Tilt:
     """
 
     rest: tuple[float, ...]
-    """Gravity without tilt (d,) [m/s2]. The vector must not be zero."""
+    """Gravity without tilt (d,) [m/s2]. Gravity must not be zero."""
 
     def gravity(self, angles: np.ndarray) -> np.ndarray:
         """Return gravity (d,) or (steps, d) [m/s2] for angles (d - 1,) or (steps, d - 1) [degrees]."""

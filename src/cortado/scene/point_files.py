@@ -26,7 +26,7 @@ from cortado.files.disk import cached_by_file, reason
 MOST_POINTS = 10_000_000
 REFUSED = 3
 ROOM = 2**30
-"""Constant part of the reading process's memory limit [byte]. The limit also includes 20 times the size of the file."""
+"""Constant part of the reading process's memory limit [byte]. The limit also includes 20 times the file's size."""
 
 
 class Refused(Exception):

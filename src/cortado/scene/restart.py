@@ -76,7 +76,7 @@ class Origin:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RestartState(ShortRepr):
-    """The complete state at the end of a step. `Trajectory.last_state` returns it, and `Simulation.run` accepts it."""
+    """The complete state at the end of a step. `Simulation.run` accepts `Trajectory.last_state`."""
 
     fields: Mapping[str, NDArray]
     """Arrays by field name.
@@ -84,8 +84,8 @@ class RestartState(ShortRepr):
     The arrays are positions (n, d) [m], velocities (n, d) [m/s], mass_fractions (n, phases), and reference_density (n,)
     [kg/m3]. The reference density is the mass of a particle divided by its volume on the rest lattice.
 
-    An emitter with the name NAME has two more arrays. NAME.outlet (1, d) is the position of its opening [m].
-    NAME.emitted (1,) is the length of the emitted column [m]. Some solvers add fields.
+    An emitter with the name NAME has two more arrays. NAME.outlet (1, d) is the position of the emitter's opening [m].
+    NAME.emitted (1,) is the length of the emitted column [m]. Some solvers add fields to the state.
     """
     clock: Clock = field(default_factory=Clock)
     """Time of the state."""

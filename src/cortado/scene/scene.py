@@ -69,7 +69,7 @@ class Scene(SceneTables):
         """Return the scene with new values: ``scene.replaced("solver.time_step=0.002", "phase.oil.viscosity=2")``.
 
         Overrides are written as for `load_scene`. A relative file name in an override starts at the current folder.
-        Raises `SceneError` as `load_scene` does.
+        Raises the same `SceneError` as `load_scene`.
         """
         return Scene.from_json(self.to_json(), overrides, "the scene")
 
@@ -311,7 +311,7 @@ def put_in(data: dict[str, Any], overrides: Sequence[str], file: str, unread: Se
 
 
 def _require_shallow(text: str, file: str) -> None:
-    """Raise `SceneError` for a dotted key with too many parts. Call this before the parser."""
+    """Raise `SceneError` for a dotted key with too many parts. Call this function before the parser."""
     plain = _ASIDE.sub(lambda found: "" if found[0].startswith("#") else "text", text)
     if deep := _TOO_DEEP.search(plain):
         raise _too_deep(file, deep[0])

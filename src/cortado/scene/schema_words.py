@@ -69,7 +69,7 @@ def _limits(schema: Schema) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit of a key such as ``phase.0.viscosity``. The text is empty for a key without a unique unit."""
+    """Return the unit of a key such as ``phase.0.viscosity``. For a key without a unique unit, the text is empty."""
     found = list(_choices(_schema()))
     for part in key.split("."):
         inner = [one.get("items", {}) if part.isdigit() else one.get("properties", {}).get(part, {}) for one in found]

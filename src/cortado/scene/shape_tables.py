@@ -178,7 +178,7 @@ def _crossing(corners: Points) -> tuple[int, int] | None:
 
 
 class Container(Table):
-    """A container of the fluid. The base class is free space."""
+    """A container of the fluid. The base class of containers is free space."""
 
     sticks: ClassVar[Any] = False
     finish: ClassVar[Any] = None
@@ -258,7 +258,7 @@ class Walled(Table):
 
 
 class BoxContainer(Walled, BoxShape, Container):
-    """A box-shaped container. It is closed on all sides except along periodic axes."""
+    """A box-shaped container. The container is closed on all sides except along periodic axes."""
 
     periodic: Vector[Flag] = (False, False, False)
     """(d,) Whether each axis is periodic. Fluid that leaves through one side of a periodic axis enters through the

@@ -197,10 +197,10 @@ class SheetSolid(SolidTable):
         tuple[Annotated[tuple[Length, ...], Field(min_length=2, max_length=3)], ...] | None, Field(min_length=2)
     ] = None
     """(m, d) Corners in order [m]. In 2-D the corners follow the line, and the last corner may equal the first. In 3-D
-    the corners go around the polygon."""
+    the corners are in order around the polygon."""
     file: File | None = None
-    """File of a mesh in 3-D, in place of `corners`: STL, OBJ, PLY, glTF or GLB. The mesh may be open. A relative path
-    starts at the scene file's folder."""
+    """File of a mesh in 3-D, in place of `corners`: STL, OBJ, PLY, glTF or GLB. The sheet's mesh may be open. A
+    relative path starts at the scene file's folder."""
     scale: Annotated[float, quantity(gt=0.0)] = 1.0
     """Factor that converts lengths in the file to metres, such as 0.001 for millimetres."""
 

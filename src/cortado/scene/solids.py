@@ -33,7 +33,7 @@ class SolidTable(Coloured):
     """Initial rotation about the centroid [rad]; no rotation if left out. The value is a rotation vector in 3-D, and a
     counterclockwise angle in 2-D."""
     motion: Literal["fixed", "path", "free"] = "fixed"
-    """How the solid moves. A "fixed" solid does not move. A "path" solid moves as `positions`, `rotations`, the file
+    """Motion of the solid. A "fixed" solid does not move. A "path" solid moves as `positions`, `rotations`, the file
     `path`, `velocity` or `angular_velocity` prescribe. A "free" solid is a rigid body that fluid and gravity move."""
     density: Annotated[float, quantity("kg/m3", gt=0.0)] | None = None
     """Density of a free body [kg/m³]: its mass divided by its volume."""
@@ -66,8 +66,8 @@ class SolidTable(Coloured):
     first rotation is 0."""
     path: File | None = None
     """A CSV file in place of `times`, with columns such as time [s], x [mm], y [mm] and rotation [deg]. In 3-D the
-    rotations are rotation_x [deg], rotation_y [deg] and rotation_z [deg]. Only differences from the first line matter.
-    A missing column counts as 0. A relative path starts at the scene file's folder."""
+    rotations are rotation_x [deg], rotation_y [deg] and rotation_z [deg]. Only differences from the file's first line
+    matter. A missing column counts as a column of zeros. A relative path starts at the scene file's folder."""
     interpolation: Interpolation = "linear"
     """Interpolation between `times`: linear, or a cubic spline. The spline has continuous velocity and acceleration,
     and velocity 0 at both ends."""

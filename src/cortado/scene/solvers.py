@@ -60,7 +60,7 @@ class SolverTable(Table):
 
 
 class ProjectionSolver(SolverTable):
-    """A solver that projects velocities to zero divergence. Its pressure may be negative inside the fluid."""
+    """A solver that projects velocities to zero divergence. The solver's pressure may be negative inside the fluid."""
 
     kind: Literal["projection"] = "projection"
     iterations: Annotated[int, count(2, 1_000)] = 2
@@ -128,7 +128,7 @@ class PackageSolver(SolverTable, PackageTable):
 
 
 def what_suits(solver: Any, container: Any) -> Suits:
-    """Return the defaults that a solver sets in other tables. Both arguments are tables or dicts."""
+    """Return the defaults that a solver sets in other tables. Each argument is a table or a dict."""
     if _table_of(solver) != "ProjectionSolver":
         return ()
     periodic = container.get("periodic") if isinstance(container, Mapping) else getattr(container, "periodic", None)

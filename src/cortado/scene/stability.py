@@ -114,11 +114,11 @@ def divergence_advice(scene: SceneTables, values: Arrays, time_step: float) -> s
 
 
 def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[str, float]:
-    """Return the stability limits of the time step [s] by name. A limit that does not apply is infinite. In the
-    formulas h is the support radius, s the spacing and g gravity.
+    """Return the stability limits of the time step [s] by name. A stability limit that does not apply is infinite. In
+    the formulas h is the support radius, s the spacing and g gravity.
 
     Courant: 0.4 h / v (Monaghan 1992). The speed v is the larger of the initial speed and the speed after a free fall
-    through the container. Speeds of emitted fluid count as well.
+    through the container. The speed v also covers emitted fluid.
 
     Solids: beside a solid, fluid moves at most 0.4 spacings in a time step, and at most a quarter of the solid's
     thickness.

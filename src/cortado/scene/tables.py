@@ -31,7 +31,7 @@ FieldPath = Sequence[str | int]
 
 @dataclass(frozen=True, repr=False)
 class FieldError:
-    """An error in a field. Its ``repr`` hides the invalid value, which may be long."""
+    """An error in a field. The ``repr`` of the error hides the invalid value, which may be long."""
 
     path: tuple[str | int, ...]
     found: Any
@@ -45,7 +45,7 @@ def field_error(path: FieldPath, found: Any, wanted: str, sentence: str | None =
 
 
 def check_name(path: FieldPath, name: str | None, names: Sequence[str], kind: str, otherwise: str = "") -> None:
-    """Raise a `field_error` if a name is not in ``names``. Without names the message is ``otherwise``."""
+    """Raise a `field_error` if a name is not in ``names``. If ``names`` is empty, the message is ``otherwise``."""
     if name not in names:
         raise field_error(path, name, f"the name of {kind}, of {shown(names)}" if names else otherwise)
 
