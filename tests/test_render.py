@@ -374,7 +374,7 @@ def test_wrong_input_is_a_sentence():
         (lambda: camera(position=(0, 1)), "position is .* must be 3 finite numbers"),
         (lambda: camera(field_of_view=180.0), "field_of_view is 180.0, but must be between 0 and 180"),
         (lambda: camera(resolution=(0, 4)), "resolution is .* positive whole numbers"),
-        (lambda: camera(near=2.0, far=1.0), "near is 2.0 and far 1.0"),
+        (lambda: camera(near=2.0, far=1.0), "near is 2.0 and far is 1.0"),
         (lambda: Orthographic((0, 1, 0), (0, 0, 0), (0, 0, 1), 0.0), "width is 0.0"),
         (lambda: Volume(camera(), -1.0), "extinction is -1.0, but must be a positive number"),
         (lambda: Volume(camera(), 1.0, (0, 1)), "background is .* 3 finite numbers"),

@@ -159,7 +159,9 @@ def test_a_state_that_another_solver_carried_is_refused():
         pass
 
     state = Simulation(moving(), solver=MakeRemembering()).run(3).last_state
-    with pytest.raises(InputError, match=r"what the solver MakeRemembering carries .*, but must be of .*MakeOther"):
+    with pytest.raises(
+        InputError, match=r"additional state fields of the solver MakeRemembering, but must be of .*MakeOther"
+    ):
         Simulation(moving(), solver=MakeOther()).run(2, state=state)
     with pytest.raises(InputError, match=r"state has .*memory, .*, but must have positions"):
         Simulation(moving()).run(2, state=state)
@@ -212,7 +214,7 @@ class Uncounted(Falling):
         (Wrong(None, [number("gravity")]), {}, "parameter gravity of a solver has the name of another one"),
         (MakeRemembering(np.nan), {}, "parameter memory.rate has a value that is not finite"),
         (MakeFalling(), {"batch": 2}, "batch is 2, but must be left out, as .* MakeFalling supports no batches"),
-        (Makes(ParticleSolver), {}, "build of the solver Makes returned .*, which has no step, but must have one"),
+        (Makes(ParticleSolver), {}, "build of the solver Makes returned .*, which has no method step, but must have"),
         (Makes(Uncounted), {}, r"solver Uncounted does not count its steps: .* self\.end_step"),
         (Wrong(Alone()), {"forces": [Breeze()]}, "forces is given, but must be left out, as the solver Wrong takes no"),
     ],
