@@ -134,7 +134,7 @@ def picture(
     """
     words = arguments.as_text(overrides)
     if film and frame is not None:
-        raise InputError("--frame is given, but must be left out, as --film has all frames.")
+        raise InputError("--frame is given, but must be left out, as --film shows all frames.")
     if lines is not None:
         _refuse(words, ("width", "height"), "--lines already sets the size of the picture")
     if colour is not None:

@@ -145,7 +145,7 @@ def sum_of(dtype: Any, particles: int, device: Any, members: int = 1) -> TreeRed
 
 
 def sum_and_maximum(particles: int, precision: Precision, device: Any, members: int = 1) -> TreeReduction:
-    """The sum is over the first components of pairs, and the maximum is over the second components."""
+    """Return a reduction of pairs to the sum of first components and the maximum of second components."""
     level = sum_and_maximum_kernel(precision, device.is_cpu)
     return TreeReduction(level, precision.pair, particles, device, members)
 

@@ -233,7 +233,7 @@ def versions() -> str:
 
 
 def call(payload: Payload, item: bytes) -> Answer | Lacking:
-    """This function runs in a worker process. The answer contains any exception of the payload's function."""
+    """Run the payload's function in a worker process. The answer contains any exception of the payload's function."""
     with _one_at_a_time, warnings.catch_warnings(record=True) as caught:
         if payload.content is None and payload.digest not in _functions:
             return Lacking()

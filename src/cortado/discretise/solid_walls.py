@@ -61,7 +61,7 @@ def surface_points(solid: Solid, spacing: float, depth: float) -> SurfacePoints:
 
 
 def evenly_chosen(candidates: Points, fine: float, spacing: float) -> SurfacePoints:
-    """First, as many points as possible are chosen at a least distance. Each point then moves to the candidate nearest
+    """First, candidates at a least distance from each other are chosen. Each point then moves to the candidate nearest
     to the centroid of its closest candidates (Lloyd 1982). Finally, points closer than a least distance are removed,
     and candidates fill gaps. ``fine`` [m] is the distance between candidates."""
     dimension = candidates.shape[1]
@@ -202,7 +202,7 @@ class ContainerWalls:
         return np.asarray(self.room.from_solids(feet, self._clear) >= self._clear)
 
     def keeps(self, points: Points) -> Which:
-        """Test which points are near a wall particle that keeps its position, or above the container's rim."""
+        """Test which points are near a wall particle that keeps its position, or are above the container's rim."""
         from scipy.spatial import cKDTree
 
         kept = np.asarray(self.room.from_solids(points, self.spacing) > 0.0)

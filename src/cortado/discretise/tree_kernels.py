@@ -260,7 +260,7 @@ def faces_type(precision: Precision) -> Any:
         starts: wp.array(dtype=wp.int32)
         """Index of the first face of each sheet."""
         middles: wp.array(dtype=vector)
-        """Centre of each sheet [m]. Positions of the sheet's faces are relative to this centre."""
+        """Centre of each sheet [m]. Positions of a sheet's faces are relative to the sheet's centre."""
         normals: wp.array(dtype=vector)
         places: wp.array2d(dtype=vector)
         """A point on each boundary of each face (faces, 3) [m]."""

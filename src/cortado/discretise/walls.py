@@ -275,7 +275,7 @@ def wall_weights(
 
     ``flat`` (b,) are the weights in a flat wall. The last ``known`` of these weights are final. If the wall particles
     are on lattices (``are_even``), weights are at least 0, and otherwise at least `LEAST` times ``flat``. ``crossed``
-    is given only for the wall particles of a sheet. Such particles interact only with fluid across the sheet.
+    is given only for the wall particles of a sheet. The particles interact only with fluid across the sheet.
     """
     from scipy.sparse import coo_array, vstack
 

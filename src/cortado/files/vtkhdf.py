@@ -7,7 +7,7 @@ the two parts for each frame. A change of the selected part makes a frame appear
 size.
 
 HDF5 only creates the file in memory, because it crashes on a full disk (HDF5 2.0). Plain writes copy the file to disk
-and add frames. One write of eight bytes then stores the number of frames and the CRC-32 of the frames. HDF5's checksums
+and add frames. A last write of eight bytes stores the number of frames and the CRC-32 of the frames. HDF5's checksums
 and its mode for one writer and many readers are not used. VTK cannot open files with such checksums or in this mode
 after the writing process was killed.
 

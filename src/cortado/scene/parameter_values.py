@@ -103,7 +103,7 @@ class Known(FixedDict):
     __eq__, __ne__, __hash__ = object.__eq__, object.__ne__, object.__hash__  # type: ignore[assignment]
 
     def __init__(self, own: Iterable[tuple[Parameter, str]] = ()):
-        """Add ``own``: parameters of forces and of a solver, each with a description of its force or solver.
+        """Add the parameters ``own`` of forces and of a solver, each with a description of the force or solver.
 
         Raises `InputError` for a name that occurs twice. Only the parameter `TIME` may occur several times.
         """

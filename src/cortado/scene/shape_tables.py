@@ -216,7 +216,7 @@ class Container(Table):
         return 0.0 if ends is None else surface_cells(*ends, spacing)
 
     def periods(self, dimension: int) -> tuple[Points, Points]:
-        """Return the lower corner and the lengths (d,) [m] of the periodic box. Other axes have the length 0."""
+        """Return the lower corner and the lengths (d,) [m] of the periodic box. Non-periodic axes have the length 0."""
         return np.zeros(dimension), np.zeros(dimension)
 
     def mirrors(self, dimension: int, support: float) -> tuple[Points, Points]:

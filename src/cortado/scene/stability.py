@@ -118,7 +118,7 @@ def stability_limits(scene: SceneTables, values: Arrays | None = None) -> dict[s
     the formulas h is the support radius, s the spacing and g gravity.
 
     Courant: 0.4 h / v (Monaghan 1992). The speed v is the larger of the initial speed and the speed after a free fall
-    through the container. The speed v also covers emitted fluid.
+    through the container. The speed v is at least the speed of emitted fluid.
 
     Solids: beside a solid, fluid moves at most 0.4 spacings in a time step, and at most a quarter of the solid's
     thickness.
