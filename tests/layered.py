@@ -68,7 +68,7 @@ BAD_STATES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "a negative time": (lambda s: {**s, "time": s["time"] - 1.0}, "state clock is at -1.0 s, but must be"),
     "another fluid": (lambda s: {**s, "reference_density": 2.0 * s["reference_density"]}, "state reference_density is"),
     "outside": (lambda s: {**s, "positions": s["positions"] + 5.0}, "outside the container"),
-    "another spacing": (lambda s: {**s, "positions": 0.5 * s["positions"]}, "spacings of 0.05 m from the nearest"),
+    "another spacing": (lambda s: {**s, "positions": 0.5 * s["positions"]}, "spacings of 0.05 m between neighbours"),
 }
 """What is done to a state, and words of the sentence that it is refused with."""
 BAD_PARAMETERS: dict[str, tuple[Callable[[], Any], str]] = {

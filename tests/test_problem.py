@@ -223,7 +223,7 @@ def test_a_gradient_that_is_not_finite_is_warned_of(simulation):
         (lambda it: cortado.certify(it, nmes=["gravity"]), "certify is called in a wrong way .* 'nmes'"),
         (lambda it: it.simulation.run(number=3), "^Simulation.run is called in a wrong way .*'number'"),
         (lambda it: Problem(it.simulation, 5, Wrong(np.zeros((125, 3)))).value_and_gradient(GRAVITY), r"shape .7, 3"),
-        (lambda it: without_volume(), r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but must be such"),
+        (lambda it: without_volume(), r"^mass_fractions of particle 5 are \[3.0, -2.0, 0.0\], but the sum of"),
         (lambda it: Simulation(plane_of_three(), free_energy="miscible"), "^free_energy is .miscible., but must be a"),
         (lambda it: Simulation(splash(), free_energy=MISCIBLE), r"left out, as the scene has only one phase\.$"),
     ],

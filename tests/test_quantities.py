@@ -134,7 +134,7 @@ def test_a_wrong_name_is_told_those_that_there_are():
     known = "positions, velocities, mass_fractions, reference_density, density, pressure, speed"
     with pytest.raises(InputError, match=f"quantity is 'presure', but must be one of {known}"):
         simulation.quantity("presure")
-    with pytest.raises(InputError, match="without a pressure"):
+    with pytest.raises(InputError, match="computes no pressure"):
         cortado.Simulation(plane(forces={"pressure": False})).quantity("pressure")
     end = cortado.Problem(simulation, 1, Squares({"density": 1.0})).end({})
     with pytest.raises(InputError, match="a field of a state is 'rho', but must be one of positions, velocities"):

@@ -337,7 +337,7 @@ def test_solids_at_rest_carry_nothing_and_views_that_turn_have_no_images():
             cortado.Simulation(plane(solid=[sill]), precision="float64").run(1, sensors={"mine": sensor})
     for make, words in (
         (lambda: PressureProbe([0.1, 0.1], on=3), "on is 3, but must be the name"),
-        (lambda: WallForce(axes="body"), "as the sensor is on no solid"),
+        (lambda: WallForce(axes="body"), "as no solid carries the sensor"),
         (lambda: SolidLoad("sill", axes=1), 'axes is 1, but must be "world" or "body"'),
     ):
         with pytest.raises(InputError, match=words):

@@ -139,11 +139,11 @@ def test_after_the_last_step_a_solid_goes_on():
 
 MISTAKES = [
     (lambda: SolidLoad(3), "solid is 3, but must be the name of a solid"),
-    (lambda: Simulation(plane(ROTOR)).run(1, sensors={"a": SolidLoad("cup")}), "solid 'cup', but the scene has rotor"),
+    (lambda: Simulation(plane(ROTOR)).run(1, sensors={"a": SolidLoad("cup")}), "on 'cup', but the scene has rotor"),
     (lambda: Simulation(plane(ROTOR)).run(1, record=["rotor.load"]), "record is 'rotor.load', but must be one of"),
     (lambda: plane(ROTOR, sensor=[{"kind": "solid_load", "name": "a", "solid": "cup"}]), "solid.*the name of a solid"),
     (lambda: plane(sensor=[{"kind": "solid_load", "name": "a", "solid": "cup"}]), "of a scene with solids"),
-    (lambda: Simulation(plane(ROTOR, forces={"pressure": False})).quantity("rotor.load"), "without a pressure"),
+    (lambda: Simulation(plane(ROTOR, forces={"pressure": False})).quantity("rotor.load"), "computes no pressure"),
 ]
 
 

@@ -113,7 +113,7 @@ def test_what_a_solver_does_not_know_is_said_in_a_sentence(scene, live, monkeypa
     with window(scene, PORT + 3) as shown:
         own = coloured(shown, "phase")
         np.testing.assert_array_equal(coloured(shown, "pressure"), own)
-        assert "without a pressure" in shown.window.legend.content
+        assert "computes no pressure" in shown.window.legend.content
     monkeypatch.setattr(views, "ParticleSolver", int)  # a solver of another kind
     own = coloured(live, "phase")
     np.testing.assert_array_equal(coloured(live, "density"), own)
