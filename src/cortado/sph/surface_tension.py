@@ -199,7 +199,7 @@ def force(setting: Setting) -> Force:
         if viscosity < least:
             warn(
                 f"the viscosity of phase {phase.name!r} is {viscosity:g} Pa s, but should be at least "
-                f"{least:.2g} Pa s for this amount of fluid and a surface tension of {tension:g} N/m: otherwise the "
+                f"{least:.2g} Pa s for this amount of fluid and a surface tension of {tension:g} N/m. Otherwise the "
                 "surface gains energy and throws out particles."
             )
     if form == "curvature":
