@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
 from itertools import product
@@ -15,6 +16,7 @@ import pytest
 import cortado
 from bad_scenes import plane
 from cortado import gradients, losses, optimisers
+from cortado.calls import told
 from cortado.errors import CortadoError, InputError
 from cortado.optimisation.transforms import Affine, Logarithm, Softmax, TimeInterpolation, Transformed
 
@@ -202,3 +204,13 @@ def test_the_first_argument_of_another_type_is_named_and_a_mistake_of_ones_own_i
 
     with pytest.raises(ValueError, match="of their own"):
         cortado.evaluate(by_name()["problem"], [{}], on_result=fails)
+
+    @told
+    def takes_pairs(pairs: Iterable[tuple[str, float]]):
+        raise ValueError("of its own")
+
+    with pytest.raises(ValueError, match="of its own"):
+        takes_pairs([("density", 1.0)])
+    for pair in [("density", "high"), ("density", 1.0, 2.0)]:
+        with pytest.raises(InputError, match=r"^pairs is "):
+            takes_pairs([pair])
