@@ -52,6 +52,8 @@ MADE = {"docs": "build/docs/index.html"}
 
 def main(arguments: list[str]) -> int:
     """Runs a task, with what else is given as options of its last command."""
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):  # else each of a hundred processes compiles what it imports
+        os.environ["PYTHONPYCACHEPREFIX"] = str(VENV / "pycache")
     name, *options = arguments or [""]
     if name not in SEVERAL and name != "sanitize":
         print(f"python -m tasks TASK, one of: {', '.join((*SEVERAL, 'sanitize'))}", file=sys.stderr)
