@@ -240,7 +240,7 @@ FELL = r"The loss fell .* times, from .* m² to .* m² .*\.\n  gravity: \(.*\) m
     ("command", "drawing", "told"),
     [
         (["run", "scene.toml", "--steps", 2], "run.write_run_report", r"2 steps of .* kg/m3\.\n"),
-        (["optimise", "task.toml"], "optimise.task_figures", FELL),
+        (["optimise", "task.toml"], "optimise.solved_task.task_figures", FELL),
     ],
     ids=["run", "optimise"],
 )

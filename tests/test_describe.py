@@ -117,7 +117,7 @@ def test_steps_that_are_chosen_are_estimated():
     assert told.is_about and told.time == 0.2 and told.frames == told.steps + 1 and told.film is not None
     assert 0.5 * taken < told.steps < 2.5 * taken
     unknown = RunLength(simulation, 10, None, FramesPerSecond(50.0))
-    assert unknown.frames is unknown.trajectory is unknown.film is None and unknown.in_words == "10 steps"
+    assert unknown.frames is unknown.trajectory is unknown.film is None and unknown.steps == 10
 
 
 def test_memory_grows_with_what_is_kept(capsys):

@@ -87,7 +87,7 @@ def test_iterations_of_every_step_are_noted_and_too_few_are_told_of(monkeypatch)
     assert (both[1].diagnostics["viscous_iterations"] != noted).any()
     assert "viscous_iterations" not in Simulation(thick("explicit"), precision="float64").run(1).diagnostics
     monkeypatch.setattr("cortado.sph.viscous_solve.MOST", 3)
-    monkeypatch.setattr("cortado.sph.viscous_stress.Solve.most", 3)
+    monkeypatch.setattr("cortado.sph.viscous_solve.Solve.most", 3)
     with pytest.warns(
         CortadoWarning, match="the viscosity did not converge in 4 of 4 steps, in which the solve took 3 iter"
     ):

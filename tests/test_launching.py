@@ -98,7 +98,7 @@ def test_a_sum_that_lanes_share_is_of_a_kernel_that_is_made_for_them():
 def test_arrays_of_derivatives_that_are_gone_are_let_go():
     simulation = Simulation(two_layers())
     problem = Problem(simulation, 2, losses.FinalPositions(simulation.positions))
-    kept = simulation.solver.launch._bundles._filled
+    kept = simulation.solver.launch._bundles
     problem.value_and_gradient({"viscosity": [0.1, 0.2]})
     assert kept
     del problem

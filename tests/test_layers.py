@@ -61,7 +61,7 @@ MOST_PACKAGES = 17
 MOST_LINES = 450
 ON_TOP = ("pictures", "environments", "certificate", "cli", "runs.run_folder", "__main__", "measured")
 ON_TOP += tuple(f"optimisation.{name}" for name in ("datasets", "fitting"))
-ON_TOP += tuple(f"optimisation.{name}" for name in ("solved_task", "task_files", "task_tables"))
+ON_TOP += tuple(f"optimisation.{name}" for name in ("solved_task", "task_files", "task_tables", "transforms"))
 """Packages, and modules, that lie on top of the core; `cortado` itself has the names of all."""
 
 

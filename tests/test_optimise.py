@@ -649,7 +649,7 @@ def test_a_search_counts_what_its_averages_leave_out_and_warns_once():
     mean = EnsembleMean(0.1, samples=8, position_noise=0.0, estimator=OneOfEight([]))
     with pytest.warns(CortadoWarning) as said:
         found = optimise(Members(), {"gravity": [0.0, -9.81]}, GradientDescent(1.0), 2, gradient=mean)
-    assert [str(one.message)[:44] for one in said] == ["1 of 8 runs of the ensemble diverged, by whi"]
+    assert [str(one.message)[:44] for one in said] == ["1 of 8 runs of the ensemble diverged, so tha"]
     assert found.left_out == 6 and [one.left_out for one in found.history] == [2, 4, 6]
     assert "updates. It left 6 runs out of its averages, as runs diverged or" in found.message
 

@@ -65,7 +65,7 @@ def test_a_rollout_takes_derivatives_of_its_own_alone():
         rollout.backward(Exact().derivative(rollout), {})
     with pytest.raises(InputError, match="was made for another rollout"):
         rollout.backward(Exact().derivative(other), {})
-    with pytest.raises(InputError, match="cannot go along a tangent"):
+    with pytest.raises(InputError, match="cannot run along a tangent"):
         other.tangent(simulation.solver.new_state(), simulation.solver.new_parameters(3), lambda step, dot: None)
     rollout.forward()
     with pytest.raises(InputError, match="bars has the state 7, but must have states from 0 to 3"):

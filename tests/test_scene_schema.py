@@ -193,7 +193,7 @@ def test_one_phase_needs_no_fractions_and_several_do():
     renderer = Simulation(plane(), precision="float64").renderer()
     x = Simulation(plane()).positions
     np.testing.assert_array_equal(renderer.render(x), renderer.render(x, np.ones((len(x), 1))))
-    with pytest.raises(InputError, match=r"^fractions is left out, but must be mass fractions \(64, 3\), as"):
+    with pytest.raises(InputError, match=r"^fractions is left out, but must be mass fractions \(64, 3\)"):
         Simulation(plane_of_three()).renderer().render(np.zeros((64, 2)))
 
 

@@ -64,7 +64,7 @@ def test_a_nozzle_begins_at_its_outlet_and_stays_inside_and_a_tilt_needs_a_gravi
     first, *others = nozzle(made)["values"]
     for values, words in [
         ([[0.0, 0.0], *others], r"path\.values\[0\] is .* but must be emitter\[0\]\.outlet"),
-        ([first, [9.0, 9.0], first], r"path\.values\[1\] is \[9\.0, 9\.0\], but the whole ope"),
+        ([first, [9.0, 9.0], first], r"path\.values\[1\] is \[9\.0, 9\.0\], but must be where all of the ope"),
     ]:
         with pytest.raises(SceneError, match=words):
             jet(path=nozzle(made, values=values))
