@@ -1,8 +1,8 @@
 """What `make test` runs of all tests, which are those of `make test-all`.
 
-Of a test with several parameters it runs so many cases that every value of each parameter is in one of them, not all
-combinations; and of cases in `tests/seconds.csv` those in `KEPT` alone. They take at least 3 s, or need kernels that
-few others need, so that they take long on a new clone. Rows of the first are written from pytest's report:
+Of cases in `tests/seconds.csv` it runs those in `KEPT` alone: they take at least 3 s, or need kernels that few others
+need, so that they take long on a new clone. Of the other cases of a test it runs so many that every value of each
+parameter that they have is in one of them, not all combinations. Rows of slow cases are written from pytest's report:
 
     pytest --short --junitxml=suite.xml; python tests/short.py suite.xml
 """
@@ -69,7 +69,10 @@ def is_slow(item) -> bool:
 
 def short(items: Iterable) -> list:
     """What `make test` runs."""
-    return [item for item in with_each_value(items) if not is_slow(item) or item.name in KEPT.get(item.path.stem, ())]
+    items = list(items)
+    kept = {id(item) for item in items if item.name in KEPT.get(item.path.stem, ())}
+    kept |= {id(item) for item in with_each_value([item for item in items if not is_slow(item)])}
+    return [item for item in items if id(item) in kept]
 
 
 def values_of(item) -> set[Value]:
