@@ -100,7 +100,7 @@ class AdjointGrowth:
         self._warned = False
 
     def follow(self, rollout: Rollout, squares: np.ndarray) -> None:
-        """Add a call. ``squares`` are the `sums_of_squares` of the adjoints of its last and first state."""
+        """Add a call. ``squares`` are sums over the adjoints of its last and its first state."""
         size = float(rollout.time_steps[0])
         start, end = (rollout.clocks[0].after(steps, size).time for steps in (0, rollout.steps))
         into, out = np.sqrt(squares, dtype=np.float64).reshape(2, 2).tolist()
@@ -121,13 +121,10 @@ class AdjointGrowth:
             warn(f"The adjoint of the state has grown {found} over {self._steps} steps, {back}: {advice}.")
 
 
-def sums_of_squares(*states: State) -> wp.array:
+def write_sums_of_squares(sums: wp.array, *states: State) -> None:
     """Sum the squares of positions and of velocities of each state, without waiting for a GPU."""
-    arrays = [array for state in states for array in (state.positions, state.velocities)]
-    found = wp.empty(len(arrays), dtype=arrays[0].dtype._wp_scalar_type_, device=arrays[0].device)
-    for k, array in enumerate(arrays):
-        wp.utils.array_inner(array, array, out=found[k : k + 1])
-    return found
+    for k, array in enumerate(array for state in states for array in (state.positions, state.velocities)):
+        wp.utils.array_inner(array, array, out=sums[k : k + 1])
 
 
 class Stepper:
@@ -223,7 +220,7 @@ class Stepper:
         values = residual.values
         residual.evaluation.bring_back()
         first = rollout.backward(adjoint, {rollout.steps: self._bar})
-        sizes = sums_of_squares(self._bar, first)
+        write_sums_of_squares(self._squares, self._bar, first)
         found = adjoint.parameters()
         earlier = space.time_adjoints(rollout, values, found)
         before = (earlier[0] if self._simulation.batch is None else earlier) + times
@@ -235,7 +232,7 @@ class Stepper:
         rows = self._rows.adjoints(residual.rows, found, lost)
         state = {**place.read(first, lost), **time_bar}
         if rollout.steps:
-            self._simulation.__dict__.setdefault("_growth", AdjointGrowth()).follow(rollout, sizes.numpy())
+            self._simulation.__dict__.setdefault("_growth", AdjointGrowth()).follow(rollout, self._squares.numpy())
         return state, {**without_lost(lost, own), **rows}
 
     @in_turn
@@ -268,6 +265,11 @@ class Stepper:
     @cached_property
     def _bar(self) -> State:
         return self.rollout.solver.new_state()
+
+    @cached_property
+    def _squares(self) -> wp.array:
+        positions = self._bar.positions
+        return wp.empty(4, dtype=positions.dtype._wp_scalar_type_, device=positions.device)
 
     @cached_property
     def _dots(self) -> tuple[State, Parameters]:
