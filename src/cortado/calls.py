@@ -123,7 +123,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind is Callable and inner and isinstance(inner[0], list):
         return _takes(value, len(inner[0]))
     if kind is tuple and inner and inner[-1] is not ...:
-        return len(value) == len(inner) and all(map(_fits, value, inner))
+        return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
     if inner and isinstance(value, Mapping):
         return all(_fits(one, inner[-1]) for one in value.values())
     return not (inner and isinstance(value, (list, tuple))) or all(_fits(one, inner[0]) for one in value)
