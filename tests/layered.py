@@ -54,7 +54,7 @@ def without(table: dict[str, Any], name: str) -> dict[str, Any]:
 
 ARRAY = r"(an array|a tensor) of (torch\.)?"
 BAD_STATES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "no table": (lambda s: 3.0, "state is 3.0, but must be a table by name"),
+    "no table": (lambda s: 3.0, "state is 3.0, but must be a dictionary"),
     "left out": (lambda s: None, "state is left out, but must have positions"),
     "without a field": (lambda s: without(s, "velocities"), "state has .*, but must have positions, velocities"),
     "without its time": (lambda s: without(s, "time"), "state has .*, but must have .* time"),
@@ -72,7 +72,7 @@ BAD_STATES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 }
 """What is done to a state, and words of the sentence that it is refused with."""
 BAD_PARAMETERS: dict[str, tuple[Callable[[], Any], str]] = {
-    "no table": (lambda: [1.0], r"parameters is \[1.0\], but must be a table by name"),
+    "no table": (lambda: [1.0], r"parameters is \[1.0\], but must be a dictionary"),
     "unknown": (lambda: {"gravty": np.zeros(2)}, "parameter 'gravty' is unknown, but must be one of"),
     "of another scene": (lambda: {"surface_tension": 1.0}, "parameter surface_tension is given, but must be left out"),
     "another shape": (lambda: {"gravity": np.zeros(3)}, r"parameter gravity has shape \(3,\), but must be \(2,\)"),

@@ -110,7 +110,7 @@ REFUSED = [
     (lambda at: at.make_one(size=3), 'size is 3, but must be "small" or "large".'),
     (lambda at: at.make(1, max_episode_steps=0), "max_episode_steps is 0, but must be a whole number of at least"),
     # fits
-    (lambda at: at.fit([1.0]), "start is [1.0], but must be a table by name, such as {'viscosity':"),
+    (lambda at: at.fit([1.0]), "start is [1.0], but must be a dictionary, such as {'viscosity':"),
     (lambda at: at.fit({}), "start is empty, but must have a parameter to fit."),
     (lambda at: at.fit({"viscocity": 1.0}), "parameter 'viscocity' is unknown, but must be one of gravity,"),
     (lambda at: at.fit({"viscosity": 1.0}, bounds={"viscosity": (1.0, 1.0)}), "0 free numbers"),

@@ -282,7 +282,7 @@ def test_a_worker_that_is_killed_half_way_changes_nothing(problem, processes, wo
         if len(arrived) == len(POINTS) // 2:
             processes.workers[0].kill()
 
-    with pytest.warns(CortadoWarning, match="was lost; what it was computing is computed again"):
+    with pytest.warns(CortadoWarning, match="was lost; another worker computes the lost items again"):
         found = workers.map(SlowValue(problem), POINTS, kill)
     assert [loss for loss, _ in found] == [problem.value(point) for point in POINTS]
     assert sorted(arrived) == list(range(len(POINTS)))
@@ -299,7 +299,7 @@ def test_a_scheduler_without_workers_is_left_in_the_end():
     with (
         distributed.SpecCluster({}, here, silence_logs=False) as cluster,
         Distributed(cluster.scheduler_address, patience=0.5) as executor,
-        pytest.raises(ComputationError, match=r"has had no worker for \d+ s; start some, such as by `dask worker"),
+        pytest.raises(ComputationError, match=r"has had no worker for \d+ s; start workers, as with `dask worker"),
     ):
         executor.map(square, range(3))
 

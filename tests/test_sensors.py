@@ -223,7 +223,7 @@ def series_of(sensor, values=(1.0, 2.0), time_step=0.0021, parameters=None, **op
 
 
 MISTAKES = [
-    (lambda: read_by(sensors=[PROBE]), "sensors is .* but must be a table by name"),
+    (lambda: read_by(sensors=[PROBE]), "sensors is .* but must be a dictionary"),
     (lambda: read_by(sensors={"o": Odd(3.0)}), r"sensor Odd has shape \(\), but must be \(1,\)"),
     (lambda: read_by(sensors={"o": Odd("deep")}), "sensor Odd is 'deep', but must be"),
     (lambda: PressureProbe([0.0, 0.0], np.inf), "radius is inf, but must be greater than 0 and finite"),
@@ -237,7 +237,7 @@ MISTAKES = [
     (lambda: Series(PROBE, [0.0, 1.0], [1.0], 0.1), "values has shape"),
     (lambda: Series(PROBE, [1.0, 0.0], [1.0, 1.0], 0.1), "times must be"),
     (lambda: read_by(sensors={"p": PressureProbe([0.0] * 3)}), "position has 3 components"),
-    (lambda: read_by(batch=2, sensors={"own": Reference()}), "sensors has Reference as 'own', but sensors of a batch"),
+    (lambda: read_by(batch=2, sensors={"own": Reference()}), "sensor 'own' is a Reference, but a sensor of a batch"),
     (lambda: plane(sensor=2 * [{"kind": "wall_force", "name": "a"}]), "another name"),
     (lambda: plane(sensor=[{"kind": "wall_force", "name": "a", "lower": [0.0]}]), "2 components"),
     (lambda: table(kind="flow_rate", position=[0.1, 0.1], normal=[0.0, 0.0]), r"sensor\[0\].normal is .* not zero"),

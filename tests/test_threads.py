@@ -139,7 +139,7 @@ def test_a_pickle_whose_points_have_changed_is_refused(tmp_path):
     pickled = pickle.dumps(Simulation(plane(fluid=[fluid])))
     assert pickle.loads(pickled).particles == len(points)
     np.save(tmp_path / "points.npy", points + 0.01)
-    with pytest.raises(InputError, match="file of points that its scene names has changed"):
+    with pytest.raises(InputError, match="file of points in the scene has changed"):
         pickle.loads(pickled)
 
 

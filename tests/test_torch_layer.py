@@ -175,7 +175,7 @@ BAD_STATES = {
 }
 BAD_PARAMETERS = {
     **layered.BAD_PARAMETERS,
-    "a tensor": (lambda: torch.ones(3), "parameters is tensor.*, but must be a table by name"),
+    "a tensor": (lambda: torch.ones(3), "parameters is tensor.*, but must be a dictionary"),
     "float32": (lambda: {"viscosity": torch.tensor(3.0)}, "parameter viscosity is torch.float32, but must be torch"),
     "another device": (lambda: {"viscosity": torch.zeros((), device="meta").double()}, "viscosity is on meta"),
     "negative": (lambda: {"viscosity": tensor(-1.0)}, "parameter viscosity is -1.0, but must be at least 0"),

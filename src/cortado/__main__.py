@@ -1,4 +1,4 @@
-"""The entry point of ``cortado`` and ``python -m cortado``. Signal handlers are set before the large imports."""
+"""The entry point of ``cortado`` and ``python -m cortado``, which sets signal handlers before the slow imports."""
 
 from cortado.files import terminal as interruption
 

@@ -26,7 +26,7 @@ def as_number(value: Any) -> float | None:
 
 
 def as_numbers(what: str, value: Any) -> np.ndarray:
-    """Convert real numbers to a float64 array. Float64 arrays are not copied."""
+    """Convert real numbers to a float64 array, without a copy of float64 arrays."""
     try:
         array = np.asarray(value)
         kind = array.dtype.kind
@@ -127,7 +127,7 @@ def require_methods(what: str, value: object, names: tuple[str, ...], wanted: st
 
 def require_table(what: str, value: object, example: str) -> None:
     if not isinstance(value, Mapping):
-        raise InputError(f"{what} is {shown(value)}, but must be a table by name, such as {example}.")
+        raise InputError(f"{what} is {shown(value)}, but must be a dictionary, such as {example}.")
 
 
 def check_steps(steps: int, least: int = 1) -> int:
@@ -136,7 +136,7 @@ def check_steps(steps: int, least: int = 1) -> int:
 
 def check_step_numbers(steps: Iterable[int], most: int) -> list[int]:
     if not isinstance(steps, Iterable) or isinstance(steps, (str, bytes)):
-        raise InputError(f"steps is {shown(steps)}, but must be a list of numbers of steps.")
+        raise InputError(f"steps is {shown(steps)}, but must be a list of step numbers.")
     found = [whole_number("a number of steps", step, 0) for step in steps]
     for step in found:
         require_at_most("a number of steps", step, most)

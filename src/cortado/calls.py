@@ -28,14 +28,14 @@ _WORDS: dict[Any, str] = {
 
 
 def face(module: dict[str, Any]) -> Callable[[], list[str]]:
-    """Apply `public` to the names in a module's ``__all__``, and return a function for the module's ``__dir__``."""
+    """Apply `public` to every name in a module's ``__all__``. Return the module's function ``__dir__``."""
     names: list[str] = module["__all__"]
     module.update({name: public(module[name]) for name in names})
     return lambda: names
 
 
 def public(value: T) -> T:
-    """Wrap a function, or the public methods of a class, with `told`."""
+    """Make a function, or the public methods of a class, raise `InputError` for wrong arguments."""
     if not str(getattr(value, "__module__", "")).startswith("cortado"):
         return value
     made: Any = value
@@ -192,7 +192,7 @@ class FixedDict(dict[Any, Any]):
         return FixedDict, (dict(self),)
 
     def _refuse(self, *arguments: Any, **named: Any) -> NoReturn:
-        raise InputError("A setting of an object cannot be changed; make another object with another setting.")
+        raise InputError("Settings of an object cannot be changed; make a new object with the new settings.")
 
     __setitem__ = __delitem__ = __ior__ = _refuse
     clear = pop = popitem = setdefault = update = _refuse
@@ -209,8 +209,8 @@ def keep_own(made: object, name: str) -> None:
 class Staying:
     """A base class for objects with arrays on a device. Pickling or copying such an object raises `InputError`."""
 
-    instead: ClassVar[str] = "but NumPy arrays of what it holds can"
-    """End of the error message, which names what can be pickled."""
+    instead: ClassVar[str] = "but NumPy arrays of its contents can"
+    """End of the error message, which names the objects that can be pickled instead."""
 
     def __reduce__(self) -> NoReturn:
         name = type(self).__name__

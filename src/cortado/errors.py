@@ -1,4 +1,4 @@
-"""Cortado's errors and warnings. Each message is one sentence."""
+"""Cortado's errors and warnings, each with a message of one sentence."""
 
 import sys
 import warnings
@@ -57,7 +57,7 @@ class MissingDerivativeError(InputError):
 
 
 class SceneError(CortadoError):
-    """An error in a scene. The message has the key, the wrong value, and what the value must be. The exit code is 2."""
+    """An error in a scene. The message names the key, the wrong value and the allowed values. The exit code is 2."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
         """Store the message's parts. ``sentence`` replaces "is <found>, but must be <wanted>"."""
@@ -67,7 +67,7 @@ class SceneError(CortadoError):
         self.field = field
         """Key of the scene, such as ``fluid[0].upper``. The key is empty for an error of the whole scene."""
         self.found = found
-        """Wrong value, or a text of type `Words` that describes the mistake."""
+        """Wrong value of the key, or a `Words` text that describes the mistake."""
         self.wanted = wanted
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
@@ -100,9 +100,9 @@ class DivergedError(ComputationError):
         self.where = where
         """Text on how and where the particle was lost."""
         self.others = others
-        """Number of further particles that were lost in the same step."""
+        """Number of other particles that the same step lost."""
         self.preface = preface
-        """Sentence about all runs at the beginning of the message, if there are several runs."""
+        """First sentence of the message, about all runs of an ensemble. The sentence is empty for a single run."""
 
     def with_advice(self, advice: str) -> "DivergedError":
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
@@ -149,7 +149,7 @@ class ExtraMissingError(InputError, ImportError):
 
     def __str__(self) -> str:
         name, package = self.args
-        return f"{name} is needed for that, but is not installed: pip install {package}."
+        return f"The {name} library is not installed: pip install {package}."
 
 
 class LibraryMissingError(CortadoError, ImportError):

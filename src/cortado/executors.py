@@ -32,7 +32,7 @@ __all__ = ["Distributed", "Executor", "InProcess", "local_workers"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 OnResult = Callable[[int, Any], None]
-"""A function that is called in the caller's thread with the number of an item, from 0, and its result."""
+"""A function of an item's number, from 0, and the item's result. Executors call the function in the caller's thread."""
 
 
 class Executor(ABC):
@@ -110,8 +110,8 @@ class Distributed(Executor):
 
     def __init__(self, scheduler: "str | distributed.Client", patience: float = 60.0):
         """Connect to ``scheduler``, an address such as "tcp://10.0.0.1:8786" or a client. After the loss of all
-        workers, the executor waits for new workers for the time ``patience`` [s]. Raises `InputError` if distributed is
-        not installed or the scheduler does not answer."""
+        workers, the executor waits at most ``patience`` [s] for new workers. Raises `InputError` if distributed is not
+        installed or the scheduler does not answer."""
         module = _distributed()
         self.patience, self._owned = patience, isinstance(scheduler, str)
         self.client = _connected(module, scheduler) if isinstance(scheduler, str) else scheduler
@@ -162,11 +162,11 @@ class Distributed(Executor):
         """Replace ended workers of this machine."""
 
     def lost(self) -> ComputationError:
-        return ComputationError(f"The scheduler {self.address} was lost, and what is computed there with it.")
+        return ComputationError(f"The scheduler {self.address} was lost, and its workers too; restart both.")
 
     def deserted(self, seconds: float) -> ComputationError:
         said = f"The scheduler {self.address} has had no worker for {seconds:.0f} s"
-        return ComputationError(f"{said}; start some, such as by `dask worker {self.address} --nthreads 1`.")
+        return ComputationError(f"{said}; start workers, as with `dask worker {self.address} --nthreads 1`.")
 
 
 class _Map:
@@ -179,7 +179,7 @@ class _Map:
         self._name = f"cortado-{uuid4().hex}"
         self._most = 0
         self._counted, self._manned = -LOOK, time.monotonic()
-        """Time of the last count of workers, and time of the last count above 0 [s]."""
+        """Time [s] of the last count of workers, and time [s] of the last count that found a worker."""
 
     def results(self, items: Iterable[Item]) -> list[Any]:
         import dask
@@ -194,7 +194,7 @@ class _Map:
 
         def tell() -> None:
             while lost:
-                warn(f"The worker {lost.popleft()} was lost; what it was computing is computed again by another one.")
+                warn(f"The worker {lost.popleft()} was lost; another worker computes the lost items again.")
 
         client.subscribe_topic("all", hear)
         try:
@@ -251,7 +251,7 @@ class _Map:
                 raise self._executor.lost() from None
             except _distributed().KilledWorker as error:
                 said = f"Item {number} was given up, as {error.allowed_failures + 1} workers were lost"
-                raise ComputationError(f"{said} while they computed it: they may have too little memory.") from None
+                raise ComputationError(f"{said} while computing it; the workers may have too little memory.") from None
             except Exception as error:  # of distributed itself, such as a worker without Cortado
                 said = f"Item {number} could not be computed by a worker: {in_words(error)}."
                 raise ComputationError(said) from error
@@ -318,20 +318,20 @@ class LocalWorkers(Distributed):
         self._cluster.scale(len(self._cluster.worker_spec))
 
     def deserted(self, seconds: float) -> ComputationError:
-        why = 'there may be too little memory for it, or the script does not begin under `if __name__ == "__main__":`'
+        why = 'a process may have too little memory, or the script is not under `if __name__ == "__main__":`'
         return ComputationError(f"No worker process has started for {seconds:.0f} s; {why}.")
 
 
 @contextmanager
 def local_workers(number: int | None = None, device: str = "cpu") -> Iterator[Distributed]:
-    """Start worker processes on this machine, and end them after the ``with`` block. Lost workers are started again.
+    """Start worker processes on this machine, replace lost ones, and end all of them after the ``with`` block.
 
     ``number`` is the number of processes, by default one for each core, or one for each GPU with the ``device`` "cuda".
-    On GPUs each process sees one GPU as "cuda:0". Every process imports the script. The code of the script must
-    therefore be under ``if __name__ == "__main__":``.
+    On GPUs each process sees one GPU as "cuda:0". Every process imports the script; put its code under
+    ``if __name__ == "__main__":``.
 
-    Raises `InputError` for more processes than GPUs. On a CPU, the greatest number is 64, or four for each core if that
-    is more.
+    Raises `InputError` for more processes than GPUs. On a CPU, the limit is 64 processes, or four processes for each
+    core on machines with more than 16 cores.
 
     Example: ``with cortado.executors.local_workers() as workers: ...``
     """
@@ -380,7 +380,7 @@ def require_processes(what: str, number: object) -> None:
     most = max(PROCESSES_A_CORE * cores, LEAST_LIMIT)
     if number > most:  # type: ignore[operator]
         said = f"{what} is {shown(number)}, but must be at most {most}, as this machine has {counted(cores, 'core')}"
-        raise InputError(f"{said}: more processes than cores are no faster.")
+        raise InputError(f"{said}; more than one process per core does not save time.")
 
 
 __dir__ = face(globals())

@@ -38,7 +38,7 @@ class ImageLoss(Protocol):
 class SquaredDifference:
     """An image loss: the mean over pixels and channels of the squared difference.
 
-    If a shape does not overlap its target, the gradient does not move the shape towards the target. Use `Pyramid` then.
+    If a shape does not overlap its target, the gradient does not move the shape towards the target: use `Pyramid`.
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.SquaredDifference())``
     """
@@ -57,19 +57,19 @@ class SquaredDifference:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """An image loss: the weighted mean squared differences of the levels of a Gaussian pyramid (Burt and Adelson 1983).
+    """An image loss: a weighted sum of mean squared differences, one for each level of a Gaussian pyramid (Burt and
+    Adelson 1983).
 
     The first level is the image. Each further level is the previous level, blurred and halved in size. Coarse levels
     locate a shape before it overlaps its target, and fine levels compare outlines.
 
-    ``levels`` is the number of levels. ``weights`` has a number for each level, by default 1, 2, 4 ... from fine to
-    coarse.
+    ``levels`` is the number of levels. ``weights`` (levels,) go from fine to coarse, by default 1, 2, 4 ...
 
     Example: ``loss = cortado.losses.Image(renderer, target, cortado.image_losses.Pyramid())``
     """
 
     levels: int | None = None
-    """Number of levels, by default the number of weights. Without weights the sides of the coarsest level are 1 or 2
+    """Number of levels, by default the number of weights. Without weights, the coarsest level has at most 2 x 2
     pixels."""
     weights: tuple[float, ...] | None = None
     """Weights of the levels (levels,) from fine to coarse. They should increase, as blurring makes shapes fainter."""
@@ -81,7 +81,7 @@ class Pyramid:
             return
         numbers = np.atleast_1d(as_numbers("weights", self.weights))
         if numbers.ndim != 1:
-            raise InputError(f"weights has shape {numbers.shape}, but must be one number for each level.")
+            raise InputError(f"weights has shape {numbers.shape}, but must have one number for each level.")
         weights = tuple(numbers.tolist())
         object.__setattr__(self, "weights", weights)
         if not (np.isfinite(weights).all() and min(weights, default=-1.0) >= 0.0 and max(weights) > 0.0):
@@ -129,7 +129,7 @@ def reduce(image: Image) -> Image:
 
 
 def reduce_transposed(bar: Image, shape: tuple[int, ...]) -> Image:
-    """Return the transpose of `reduce` applied to ``bar``, an image of size ``shape`` = (rows, columns)."""
+    """Apply the transpose of `reduce` to an image ``bar``. The result has the ``shape`` (rows, columns)."""
     rows, columns = shape
     return _along_rows(_along_columns(bar, reduction(columns).T), reduction(rows).T)
 
@@ -166,7 +166,7 @@ def _difference(image: ArrayLike, target: ArrayLike) -> Image:
     if image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise InputError(f"The image has shape {image.shape}, but must be (rows, columns, 3).")
     if image.shape != target.shape:
-        raise InputError(f"The image has shape {image.shape}, but its target {target.shape}: they must be the same.")
+        raise InputError(f"The image has shape {image.shape}, but must have the target's shape {target.shape}.")
     return image - target
 
 

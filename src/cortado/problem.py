@@ -47,7 +47,7 @@ class ProblemForwardPass(Staying):
 
     loss: Any
     """Loss of the run: a number, or an array (batch,) for a batch of scenes."""
-    instead = "but the problem can, and the parameters, with which it is run again"
+    instead = "but the problem and the parameters can: run the problem again"
     _residual: Residual
     _values: Arrays
     _bars: Mapping[int, SnapshotAdjoint]
@@ -61,15 +61,15 @@ class ProblemForwardPass(Staying):
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
         """Return the gradient, computed by an ``estimator``. Later evaluations of the problem do not change the result.
 
-        ``observe`` is called with the number and the adjoint of every state, from the last to the first. Raises
-        `InputError` if the estimator's settings can change, or if it may mix scenes of a batch.
+        The backward pass calls ``observe`` with the number and the adjoint of each state, beginning with the last
+        state. Raises `InputError` for an estimator that is not hashable, or that may mix the scenes of a batch.
         """
         return self._backward(backward_step(self._residual.rollout, estimator), observe)[1]
 
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
-        """Return the gradient, and the derivatives with respect to the first state, both computed by an ``estimator``.
-        The derivatives with respect to the state are a dictionary by field name, with ``time``."""
+        """Return the gradient with respect to the parameters, and the derivatives with respect to the first state, both
+        from ``estimator``. The keys of the second dictionary are the state's field names and ``time``."""
         rollout = self._residual.rollout
         derivative = backward_step(rollout, estimator)
         first, gradient = self._backward(derivative)
@@ -101,15 +101,15 @@ class Problem:
     The following parameters may be given in any combination:
 
     - ``gravity`` (d,) or (steps, d) [m / s2]; ``time_step`` [s];
-    - instead of gravity ``tilt`` (d - 1,) or (steps, d - 1) [degrees], the angle by which the scene's gravity is
-      turned without a change of its magnitude. Gravity along -y turns towards x and, in 3-D, z; see
+    - ``tilt`` (d - 1,) or (steps, d - 1) [degrees], in place of ``gravity``: angles that turn the scene's gravity and
+      keep its magnitude. Gravity along -y turns towards x and, in 3-D, towards z; see
       `cortado.scene.parameter_values.Tilt`;
-    - ``initial_positions`` [m] and ``initial_velocities`` [m / s], (n, d) for n fluid particles, in the
-      order of the scene;
+    - ``initial_positions`` (n, d) [m] and ``initial_velocities`` (n, d) [m / s] of n fluid particles, in the order of
+      the scene;
     - ``viscosity`` [Pa s] and ``rest_density`` [kg / m3]: a number, or (phases,) with several phases;
     - with several phases, the initial ``mass_fractions`` (n, phases), ``mobility`` [m2 / s], ``interface_width`` [m];
-    - with emitters, ``NAME.path`` (d,) or (steps, d), the position of the opening after each step [m];
-    - with emitters and sinks, ``NAME.flow_rate``, a number or (steps,) [m3 / s];
+    - with an emitter NAME, ``NAME.path`` (d,) or (steps, d), positions [m] of the emitter's opening after each step;
+    - with an emitter or a sink NAME, ``NAME.flow_rate``, a number or (steps,) [m3 / s];
     - in a scene with surface tension, ``surface_tension`` [N / m];
     - with a loss of images, ``colours`` (phases, 3);
     - with user-defined forces in ``simulation.forces``, the parameters of these forces, such as ``drag.k``.
@@ -140,8 +140,8 @@ class Problem:
         The backward pass computes the remaining states again.
 
         ``state`` is the first state, or a list with one first state for each scene of a batch; see `Simulation.state`.
-        With a given ``state``, parameters apply to the steps after it, and parameters for initial values raise an
-        error.
+        With a given ``state``, parameters apply to the steps after this state, and parameters for initial values raise
+        an error.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
@@ -200,8 +200,8 @@ class Problem:
         """Return the loss and its derivatives with respect to ``parameters`` and with respect to the first state.
 
         The loss and its derivatives with respect to parameters are as in `value_and_gradient`. The derivatives with
-        respect to the state are a dictionary of float64 arrays by field name, with ``time``. For a batch, each array
-        has a first axis for the scenes.
+        respect to the state are a dictionary of float64 arrays, whose keys are field names and ``time``. For a batch,
+        each array has a first axis for the scenes.
         """
         forward_pass = self.forward_pass(parameters)
         return forward_pass.loss, *forward_pass.back_to_state(Exact() if gradient is None else gradient)
@@ -212,23 +212,23 @@ class Problem:
     ) -> Estimate:
         """Return the loss, its derivatives, and the report of the estimator ``gradient``, by default `Exact`.
 
-        Estimators with a backward pass call ``observe`` with the number and the adjoint of every state, from the last
-        to the first. `gradients.AdjointNorms` is an example of ``observe``.
+        Estimators with a backward pass call ``observe`` with the number and the adjoint of each state, beginning with
+        the last state. `gradients.AdjointNorms` is an example of ``observe``.
         """
         require_function("observe", observe, *OBSERVED)
         found = estimate(self, parameters, gradient, observe)
         kept = slice(None) if self._going is None else self._going
         broken = [name for name, value in found.gradient.items() if not np.isfinite(np.atleast_1d(value)[kept]).all()]
         if broken:
-            grew = f"is not finite, as it grew beyond what {self.simulation.precision.name} holds"
+            grew = f"is not finite, as the gradient exceeds the range of {self.simulation.precision.name}"
             advice = "try fewer steps, float64, or an estimator for long runs"
             warn(f"the gradient with respect to {', '.join(broken)} {grew}: {advice}.")
         return found
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Run forward and return the run, for later backward passes. The returned run keeps its stored states in
-        memory."""
+        """Run forward, and return the forward pass, from which backward passes start. The forward pass keeps its stored
+        states in memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -270,11 +270,11 @@ class Problem:
         self, parameters: Values, each: Iterable[tuple[Values, Observer]], steps: Iterable[int] = ()
     ) -> dict[int, Any]:
         """Run once in forward mode along several directions. Return a dictionary of the states after the given numbers
-        of ``steps``. ``each`` yields pairs of directions and an observer, as in `tangents`."""
+        of ``steps``. ``each`` yields pairs ``(directions, observe)`` of arguments of `tangents`."""
         values, along = self._checked(parameters), list[tuple[Arrays, Observer]]()
         for pair in each if isinstance(each, Iterable) else [each]:
             if not isinstance(pair, Sequence) or len(pair) != 2:
-                raise InputError(f"each has {shown(pair)}, but must have pairs of directions and a function.")
+                raise InputError(f"each contains {shown(pair)}, but must contain pairs (directions, observe).")
             directions, observe = pair
             require_arguments("observe", observe, OBSERVED)
             along.append((self._space.checked(directions, "direction"), observe))
@@ -286,8 +286,8 @@ class Problem:
 
     @in_turn
     def along(self, end: Any, quantities: Iterable[str], dot: Arrays, parameters: Values, directions: Values) -> Arrays:
-        """Return the tangents of ``quantities`` by name, at the state ``end`` of the last run. ``dot`` is the tangent
-        of the state by field name. ``directions`` are tangents by parameter name."""
+        """Return tangents of ``quantities``, by name, at the state ``end`` of the last run. ``dot`` is the tangent of
+        the state by field name. ``directions`` are tangents by parameter name."""
         names = list(quantities)
         if not names:
             return {}
@@ -301,7 +301,7 @@ class Problem:
         return self._rollout.lost
 
     def room(self, estimator: AdjointEstimator | None = None) -> int:
-        """Return the greatest number of points for `together` with an ``estimator``; see `Batchable.room`."""
+        """Return the greatest number of points that `together` accepts with ``estimator``; see `Batchable.room`."""
         if self.simulation.batch is not None or (estimator is not None and not checked_reverse(estimator).batches):
             return 1
         return self.simulation.room(self.steps, self.memory_budget if estimator else 0.0)
@@ -332,8 +332,7 @@ class Problem:
         return found
 
     def batch_of(self, size: int) -> "Problem":
-        """Return this problem for a batch of ``size`` scenes. The returned problems for the last few sizes are
-        cached."""
+        """Return this problem for a batch of ``size`` scenes. The problem caches its batches of the last two sizes."""
         if size not in self._batches:
             while len(self._batches) >= KEPT:
                 self._batches.pop(next(iter(self._batches)))
@@ -346,7 +345,8 @@ class Problem:
     def fingerprint(self) -> str:
         """Text that identifies the problem, for checkpoints.
 
-        A loss is identified by its ``fingerprint``, or by the code of its function, or else only by its type.
+        The text contains the ``fingerprint`` of the loss. A loss without a fingerprint is identified by its code if it
+        is callable, or else by its type.
         """
         simulation, energy = self.simulation, self.simulation.free_energy
         parts = {

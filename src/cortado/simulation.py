@@ -120,10 +120,10 @@ class Simulation(Stepping):
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """Positions of wall particles (b, d) [m], and the number of each wall particle's solid (b,) from
-        `wall_numbers`, or -1 for the container."""
+        """Positions (b, d) [m] of wall particles, and solid numbers (b,) of wall particles from `wall_numbers`, with -1
+        for the container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
-        """Constants of the rest lattice, and initial and prescribed masses of the fluid [kg]."""
+        """Constants of the rest lattice, and the actual and the prescribed masses [kg] of the fluid."""
         self.free_particles = discrete.fluid.emitted.start
         """Number of particles that do not start in an emitter. In arrays, particles of emitters come last."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
@@ -219,8 +219,7 @@ class Simulation(Stepping):
         sensors: Mapping[str, Sensor] | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a ``rollout`` forward and return its frames. The arguments ``record_every``, ``record``, ``sensors`` and
-        ``observe``, warnings and errors are as in `run`."""
+        """Run a ``rollout`` forward and return its frames. All other arguments, warnings and errors are as in `run`."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
@@ -249,7 +248,7 @@ class Simulation(Stepping):
         return state.numpy(self.dimension, [field.name for field in self.initial.fields if not field.is_constant])
 
     def numbers_in_frame(self, components: int) -> int:
-        """Return how many numbers a `frame` contains if each vector has ``components`` components."""
+        """Return the count of numbers in a `frame` whose vectors have ``components`` components."""
         sizes = self.particles, components, len(self.scene.phase)
         return sum(prod(field.shape(*sizes)) for field in self.initial.fields if not field.is_constant)
 
@@ -323,16 +322,16 @@ class Simulation(Stepping):
 
     def renderer(self, **settings: Any) -> Renderer:
         """Return a differentiable renderer of this simulation: ``renderer.render(trajectory[k])`` returns a picture.
-        The scene's table ``[render]`` sets the view. By default the camera looks from above, and in 2-D at the plane.
+        The scene's table ``[render]`` sets the view. The default camera looks down in 3-D, and at the plane in 2-D.
 
-        ``settings`` replace keys of ``[render]``: ``resolution=(320, 240)``, or ``view="volume", position=(1, 1, 2),
-        look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for invalid settings.
+        ``settings`` replace keys of ``[render]``, such as ``resolution=(320, 240)`` or ``view="volume", position=(1, 1,
+        2), look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for invalid settings.
         """
         return scene_renderer(self, **settings)
 
     def picture(self, frame: Frame, **settings: Any) -> ShadedPicture:
         """Return a shaded picture of a frame, (rows, columns, 3), with linear values from 0 to 1. The scene's table
-        ``[picture]`` contains the settings. ``settings`` replace keys of this table: ``width=640, height=360``.
+        ``[picture]`` contains the settings. ``settings`` such as ``width=640, height=360`` replace keys of this table.
 
         Raises:
             SceneError: settings are invalid.
@@ -345,7 +344,8 @@ class Simulation(Stepping):
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
         """Render a film of a ``trajectory`` on the device of the simulation and write it to ``path``. For ``settings``
-        see `Trajectory.film`. A quantity of ``colour`` that was not recorded, such as the pressure, is computed."""
+        see `Trajectory.film`. The film computes the quantity of ``colour``, such as the pressure, if the run did not
+        record it."""
         return on_top("simulation_film")(self, trajectory, path, settings)
 
     @property
@@ -368,8 +368,8 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """Return how many runs of ``steps`` steps should be computed together. The data of these runs fit into half of
-        the free memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
+        """Return the number of runs of ``steps`` steps to compute together. Their data fit into half of the free
+        memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
         steps, most = whole_number("steps", steps, 0), as_one_number("checkpoints", checkpoints)
         neighbours, real = build.first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
@@ -400,7 +400,7 @@ class Simulation(Stepping):
 def _made_again(made_of: tuple[Any, ...], points: str) -> Simulation:
     simulation = Simulation(*made_of)
     if simulation._points != points:
-        found = "The first positions of a simulation are others than when it was pickled, but must be the same"
-        why = "the file of points that its scene names has changed"
-        raise InputError(f"{found}: {why}. Restore it, or make the simulation anew.")
+        found = "The initial positions differ from the pickled simulation's positions"
+        why = "as the file of points in the scene has changed"
+        raise InputError(f"{found}, {why}: restore the file, or make a new simulation.")
     return simulation

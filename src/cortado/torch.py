@@ -54,7 +54,7 @@ class Steps(torch.nn.Module):
         own = {name: self.trained[name.replace(".", "/")] for name in self._names}
         for name in parameters or {}:
             if name in own:
-                raise InputError(f"parameter {name} is given, but must be left out, as the module has its own.")
+                raise InputError(f"parameter {name} is given, but must be left out, as the module trains {name}.")
         return step(self.simulation, given, {**own, **(parameters or {})}, self.steps, self.gradient)
 
 

@@ -1,4 +1,4 @@
-"""Records quantities and reads sensors during a run."""
+"""The class `Watch`, which records quantities and reads sensors during a run."""
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
@@ -47,8 +47,8 @@ class Watch:
         self._on_host = {name: one for name, one in known.items() if type(one) not in SENSORS.values()}
         if self._on_host and simulation.batch is not None:
             name, own = next(iter(self._on_host.items()))
-            wanted = "sensors of a batch must be those of cortado.sensors: read one scene's"
-            raise InputError(f"sensors has {type(own).__name__} as {name!r}, but {wanted}.")
+            wanted = "a sensor of a batch must be of a class in cortado.sensors; or run the scenes one by one"
+            raise InputError(f"sensor {name!r} is a {type(own).__name__}, but {wanted}.")
         summed: Any = {name: one for name, one in known.items() if name not in self._on_host}
         self._reader = StepReader(simulation.evaluator(), rollout, summed, self.logs) if summed else None
         self._quantities = set[str](() if self._reader is None else self._reader.quantities)
@@ -58,7 +58,8 @@ class Watch:
     def run(
         self, is_frame: Callable[[int], bool], record: Observer, observe: Callable[[int], object] | None = None
     ) -> State:
-        """Run the rollout and return its last state. States before an error or an interrupt are still read."""
+        """Run the rollout and return its last state. After an error or an interrupt, `run` still reads and records all
+        earlier states."""
 
         def look(step: int, state: State) -> None:
             if is_frame(step):
@@ -84,7 +85,7 @@ class Watch:
             self._reader.look()
 
     def frame(self, step: int, state: State) -> Arrays:
-        """Return the recorded quantities after ``step`` steps, or NaN if the next step loses a particle."""
+        """Return the recorded quantities after ``step`` steps. The values are NaN if the next step loses a particle."""
         if not self.names:
             return {}
         found, real = dict[str, NDArray](), self._rollout.solver.discretisation.precision.numpy

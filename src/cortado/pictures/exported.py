@@ -1,5 +1,5 @@
-"""The data of a run for export: the particles, the surface of the fluid, and the solids.  Surfaces end at container
-walls and enclose the volume of their particles."""
+"""The data of a run for export: the particles, the fluid's surface, and the solids. Surfaces end at container walls and
+enclose the volume of their particles."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -145,7 +145,7 @@ class Exported:
         """Rotation matrix (3, 3) that turns the upward direction of the scene to the y axis."""
         self.spacing = scene.discretisation.spacing
         self._held = (0.0, 0.0, 1.0, 1.0)
-        """The worst frame so far: relative volume error, time [s], volumes of surface and fluid [m³]."""
+        """Largest volume error so far: relative error, time [s], and volumes [m³] of the surface and of the fluid."""
 
     @cached_property
     def whole(self) -> WholeFrames:
@@ -153,11 +153,11 @@ class Exported:
 
     @property
     def series(self) -> WholeFrames | None:
-        """Frames of a series of files, or None to write every recorded state."""
+        """Frames for a series of files, or None if the series contains every recorded state."""
         return None if self._trajectory.marks is None else self.whole
 
     def frames(self, whole: WholeFrames | None = None) -> Iterator[ExportedFrame]:
-        """Yield the frames ``whole``, or by default all recorded states."""
+        """Yield evenly spaced frames ``whole``, or by default all recorded states."""
         if whole is None:
             return (self._frame(frame, k, self._trajectory.solids, k) for k, frame in enumerate(self._trajectory))
         solids = self._trajectory.solids.at(self.scene, self.times, whole.recorded, whole.times)
@@ -229,7 +229,7 @@ def _solid(shown: ShownSolid, part: str, moves: bool) -> ExportedSolid:
 
 
 def enclosed(points: Points, triangles: np.ndarray) -> float:
-    """Return the volume [m³] that is enclosed by triangles (t, 3) with corners ``points`` (p, 3) [m]."""
+    """Return the volume [m³] inside triangles (t, 3) with corners ``points`` (p, 3) [m]."""
     a, b, c = (points[corner] - points[0] for corner in triangles.T)
     return float(_sixth(a, b, c).sum())
 
@@ -237,9 +237,9 @@ def enclosed(points: Points, triangles: np.ndarray) -> float:
 def with_volume(
     points: Points, triangles: Numbers, ways: Points, places: Points, spacing: float, kept: Callable[[Points], Points]
 ) -> Points:
-    """Move the points (p, 3) [m] of a surface until the enclosed volume is n ``spacing``³ for n particles.
-    ``ways`` (p, 3) are outward unit vectors or 0, and ``places`` (n, 3) [m] are particles. ``kept`` moves points beyond
-    a     wall back to the wall."""
+    """Move the points (p, 3) [m] of a surface until the surface encloses the volume n ``spacing``³ of n particles.
+    ``ways`` (p, 3) are outward unit vectors, or 0 for fixed points. ``places`` (n, 3) [m] are particle positions. The
+    function ``kept`` moves points from beyond a wall to the wall."""
     of_points, of_particles = _bodies(points, triangles, places, spacing)
     count = max(of_points.max(), of_particles.max(initial=-1)) + 1
     wanted = np.bincount(of_particles[of_particles >= 0], minlength=count) * spacing**3
@@ -264,7 +264,7 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return body numbers of surface points (p,) and particles (n,), or -1 outside all bodies of fluid."""
+    """Number the bodies of fluid. Return the numbers for surface points (p,) and particles (n,), or -1 for no body."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree

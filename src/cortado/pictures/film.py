@@ -45,7 +45,7 @@ Panel = Callable[[int, Around], Points]
 """A function that draws a frame as a linear picture (rows, columns, 3) from 0 to 1."""
 LEAST_PIXELS = 64
 SLOW = 0.1
-"""Speed of a film below which fluid at rest is not averaged over frames [simulated seconds per second]."""
+"""Speed of a film [simulated seconds per second]. Slower films do not average fluid at rest over frames."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Page:
         return self.composed([panel(frame, ALONE) for panel in self.panels])
 
     def images(self, frames: Sequence[int], begin: int = 0, window: int = WINDOW) -> Iterator[Points]:
-        """A thread draws the next picture in advance."""
+        """Yield pictures of ``frames``. A thread draws the next picture in advance."""
         shown, count = range(begin, len(frames)), len(self.panels)
         drawn = _ahead(count, (panel(frames[n], _around(frames, n, window)) for n in shown for panel in self.panels))
         return (self.composed(list(islice(drawn, count))) for _ in shown)
@@ -88,8 +88,8 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Return stages with a common scale that fit into one page, and the number of pictures in a row. ``spare`` columns
-    of     the page stay free. Raises `InputError` if the pictures would be too small."""
+    """Return stages with a common scale that fit into one page, and the number of pictures per row. ``spare`` columns
+    of the page stay free. Raises `InputError` if the pictures would be too small."""
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
@@ -101,12 +101,12 @@ def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tup
     if min(size.values()) < LEAST_PIXELS:
         found = f"{count} pictures of {size['width']} x {size['height']} pixels fit into {page.width} x {page.height}"
         least = f"{LEAST_PIXELS} x {LEAST_PIXELS}"
-        raise InputError(f"{found}, but each must have {least}: ask for more lines, or for fewer runs.")
+        raise InputError(f"{found}, but each must have {least}: set more lines, or show fewer runs.")
     return [stage.framed(ends, stage.picture.model_copy(update=size)) for stage in stages], across
 
 
 def in_a_row(count: int, size: Points, page: Picture) -> int:
-    """Return the number of pictures in a row that shows contents of width and height ``size`` largest."""
+    """Return the number of pictures per row at which contents of width and height ``size`` appear largest."""
 
     def gain(across: int) -> float:
         down = -(-count // across)
@@ -117,14 +117,14 @@ def in_a_row(count: int, size: Points, page: Picture) -> int:
 
 
 def lacking(scene: Scene) -> str | None:
-    """Return a sentence about a missing package for shaded pictures of the scene, or None."""
+    """Return an error message if a package for shaded pictures of the scene is missing, else None."""
     if (scene.picture or Picture()).film_frames == 0 or find_spec("av"):
         return None
     return "Shaded pictures need PyAV, which is not installed: pip install av."
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """After an interruption, a second call continues the film."""
+    """Write a film. After an interruption, a second call continues the film."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -208,8 +208,8 @@ class ShownRun:
 
 
 def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the particles outside emitters and drains. Without fluid, the first layers of emitters
-    count as     outside, so that a picture is not empty. ``others`` are the fields of `Frame.others`."""
+    """Return a mask (n,) of the particles outside emitters and drains. Without fluid, the mask includes the first layer
+    of each emitter, so that pictures are not empty. ``others`` are the fields of `Frame.others`."""
     found = ~waits(scene, others, particles)
     for _, first, sample in () if found.any() else samples(scene, particles):
         found[first : first + sample.layer] = True
@@ -217,7 +217,7 @@ def is_out(scene: Scene, others: Mapping[str, Any], particles: int) -> NDArray[n
 
 
 def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
-    """Return positions (frames, n, d) [m], with waiting particles at the opening of their emitter."""
+    """Return positions (frames, n, d) [m]. Particles that wait in an emitter are at the emitter's opening."""
     places, others, count = trajectory.positions, trajectory.others, trajectory.particles
     out = np.array([is_out(scene, frame.others, count) for frame in (trajectory if scene.emitter else ())])
     for name, first, sample in samples(scene, count):
@@ -230,7 +230,7 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """Convert a mask (n,) to an index. A mask that is True everywhere becomes a slice, which copies nothing."""
+    """Convert a mask (n,) to an index. A mask of True alone becomes a slice, which copies nothing."""
     return slice(None) if out.all() else out
 
 
@@ -260,4 +260,4 @@ def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Computed = Non
     if simulation is not None:
         return sizes(name, simulation().quantity(name, trajectory), scene.dimension)
     advice = f'record it, as in simulation.run(steps, record=["{name}"]), or use simulation.film(trajectory, path)'
-    raise InputError(f"{name} was not recorded, and does not follow from positions and velocities: {advice}.")
+    raise InputError(f"{name} was not recorded, and cannot be computed from positions and velocities: {advice}.")

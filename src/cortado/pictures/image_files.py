@@ -131,7 +131,7 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
                 if file.width * file.height > most:
                     raise _too_many(path, f"{file.width} x {file.height} pixels", most)
                 if file.mode.startswith(("I", "F")):
-                    raise InputError(f"The picture {path} has more than 8 bits for a colour; save it with 8.")
+                    raise InputError(f"The picture {path} has more than 8 bits per colour; save it with 8 bits.")
                 file.load()
                 ImageOps.exif_transpose(file, in_place=True)
                 return file.copy()
@@ -140,18 +140,18 @@ def open_picture(path: str | Path, most: int = MOST_PIXELS) -> Any:
     except Image.DecompressionBombError:
         raise _too_many(path, "very many pixels", most) from None
     except UnidentifiedImageError:
-        raise InputError(f"The picture {path} cannot be read: it is none of {', '.join(FORMATS)}.") from None
+        raise InputError(f"The picture {path} cannot be read: the format is none of {', '.join(FORMATS)}.") from None
     except Exception as problem:  # of many types, where a file is damaged
         raise InputError(f"The picture {path} cannot be read: {reason(problem)}.") from problem
 
 
 def warn_of_cropping(found: str, size: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Warn if the aspect ratio of ``shape`` needs less than 99 % of a picture of ``size``."""
+    """Warn if a crop to the aspect ratio of ``shape`` keeps less than 99 % of a picture of ``size``."""
     left, top, right, bottom = _middle(size, shape)
     share = (right - left) * (bottom - top) / (size[0] * size[1])
     if share < 0.99:
         found = f"{found} {size[0]} x {size[1]} pixels, but {shape[0]} x {shape[1]} are wanted"
-        warn(f"{found}: only the middle is taken, {share:.0%} of it.")
+        warn(f"{found}: only the middle is used, {share:.0%} of the pixels.")
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float, float, float]:
@@ -162,7 +162,7 @@ def _middle(size: tuple[int, int], shape: tuple[int, int]) -> tuple[float, float
 
 
 def _too_many(path: str | Path, found: str, most: int) -> InputError:
-    return InputError(f"The picture {path} has {found}, but must have at most {most} of them; save it smaller.")
+    return InputError(f"The picture {path} has {found}, but must have at most {most}; save a smaller picture.")
 
 
 @public
@@ -276,7 +276,7 @@ def read_frames(
     folder, times, frames = Path(path), list[float](), list[np.ndarray]()
     if folder.is_dir():
         if frame_rate is None:
-            raise InputError(f"{path} is a folder of frames, but frame_rate is missing: give the frames in a second.")
+            raise InputError(f"{path} is a folder of frames, but frame_rate is missing: give the frames per second.")
         names = sorted(one for one in folder.iterdir() if one.suffix.lower() in ENDINGS)
         pictures: Iterator[tuple[float, Any]] = ((0.0, open_picture(name)) for name in names)
     else:

@@ -1,6 +1,6 @@
-"""HTML for objects in notebooks, the report.html of a run folder, and animations of particles in both.
+"""HTML for objects in notebooks, report.html of run folders, and particle animations in notebooks and reports.
 
-Reports open, and animations play, without a server or a network.
+Reports and animations need neither a server nor a network.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ def style() -> str:
 
 
 def script() -> str:
-    """The script must appear once in a page, after all animations."""
+    """Return the script of the animations, which a page must contain once, after all animations."""
     return f"<script>\n{Path(__file__).with_name('particle_view.js').read_text(encoding='utf-8')}</script>"
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = 2_200_000) -> tuple[NDArray[np.intp], int]:
-    """Return frame numbers and a stride of particles, so that an animation needs at most ``most_bytes``. ``numbers``
-    are the     bytes of one particle in one frame."""
+    """Return frame numbers, and k for every k-th particle, for an animation of at most ``most_bytes``. A particle needs
+    ``numbers`` bytes per frame."""
     count = min(frames, 120, max(most_bytes // (numbers * particles), 24))  # 24 to 120 of them
     stride = max(-(-count * numbers * particles // most_bytes), 1)
     return np.unique(np.linspace(0, frames - 1, count).astype(int)), stride
@@ -74,8 +74,8 @@ def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
     """Return HTML that shows clouds of the same size side by side, with the y axis up. ``times`` (frames,) are in
-    seconds,     and ``lines`` (k, 2, d) are end points [m]. The clouds contain every ``stride``-th particle of
-    particles with the     distance ``spacing`` [m] at rest."""
+    seconds. ``lines`` (k, 2, d) [m] are end points of lines. The clouds contain every ``stride``-th particle. At rest,
+    particles have the distance ``spacing`` [m]."""
     times, (_, particles, dimension) = np.asarray(times, dtype=float), clouds[0].positions.shape
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
     shown = np.concatenate([array.reshape(-1, dimension) for array in (*(cloud.positions for cloud in clouds), ends)])
@@ -136,7 +136,7 @@ def _base64(array: NDArray[Any]) -> str:
 
 
 def scene_view(scene: Scene, runs: Mapping[str, Iterable[Any]], times: ArrayLike) -> str:
-    """Return HTML that shows runs of a scene side by side. ``runs`` maps names to states at ``times`` (frames,) [s]."""
+    """Return HTML that shows runs side by side. ``runs`` maps names of runs to states at ``times`` (frames,) [s]."""
     turn = upright(np.asarray(scene.forces.gravity)) if scene.dimension == 3 else np.eye(2)
     states, times = {name: list(of_run) for name, of_run in runs.items()}, np.asarray(times)
     particles = len(next(iter(states.values()))[0].positions)
@@ -187,7 +187,7 @@ _KINDS = {
 WIDE = ' style="width: 100%"'
 AGAIN, LATER = "<h2>How to run it again</h2>", "<h2>Drawn later</h2>"
 MOST_NUMBERS = 6
-"""Greatest number of values of a parameter in the table."""
+"""Greatest number of values that the table shows for a parameter."""
 
 
 @dataclass(frozen=True)
@@ -202,11 +202,11 @@ class Section:
     view: str = ""
     head: Sequence[str] = ()
     rows: Sequence[Sequence[object]] = ()
-    """Rows of a table, each with its name as the first cell."""
+    """Rows of a table. The first cell of a row is the row's name."""
 
 
 def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> Path:
-    """Raises `InputError` if a picture cannot be embedded or the page cannot be written."""
+    """Write a report. Raises `InputError` if a picture cannot be embedded or the page cannot be written."""
     again = "<p>The command is not known.</p>"
     with suppress(OSError, ValueError, KeyError):
         noted = json.loads(folder.environment.read_text(encoding="utf-8"))
@@ -242,7 +242,7 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
 
 
 def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
-    """Do nothing if the run has no report."""
+    """Add a figure to the report of a run. Do nothing if the run has no report."""
     page = folder.report.read_text(encoding="utf-8") if folder.report.exists() else ""
     before, again, after = page.partition(AGAIN)
     if again:
@@ -292,7 +292,7 @@ def _figure(caption: str, path: Path) -> str:
 def _shown(path: Path, words: str, look: str = "") -> str:
     kind = _KINDS.get(path.suffix.lower())
     if kind is None:
-        raise InputError(f"{path} cannot be shown; a report takes {', '.join(_KINDS)}.")
+        raise InputError(f"{path} cannot be shown; a report can contain {', '.join(_KINDS)}.")
     try:
         content = b64encode(path.read_bytes()).decode()
     except OSError as problem:
@@ -382,7 +382,7 @@ def as_words(found: object) -> str:
 
 
 def picture(found: object, draw: Callable[[Path], Any]) -> str:
-    """Return an empty text if a drawing package is missing."""
+    """Return HTML of a drawn picture, or an empty text if a drawing package is missing."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         try:

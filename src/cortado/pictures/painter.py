@@ -1,4 +1,4 @@
-"""Draw scenes, texts, lines and colour scales on pictures, and draw the picture of a scene before a run."""
+"""Draw scenes, texts, lines and colour scales on pictures, and draw scenes before a run."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -40,12 +40,13 @@ def painter(
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Positions are (n, d) or (frames, n, d) [m]. The stage has room for the solids at all ``poses``."""
+    """Return a stage for positions (n, d) or (frames, n, d) [m]. The picture has room for the solids of all
+    ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Return linear colours (n, 3), mixed from the ``colours`` (phases, 3) of phases or of the scene."""
+    """Mix linear colours (n, 3) from the phases' ``colours`` (phases, 3), by default from the scene."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))
@@ -129,13 +130,13 @@ def written(image: Points, texts: Sequence[Text], size: int) -> Points:
 
 
 def length_of(text: str, size: int) -> float:
-    """Return the width of a text in pixels, with letters of ``size`` pixels."""
+    """Return the width [pixels] of a text with letters of ``size`` pixels."""
     return float(_font(size).getlength(text))
 
 
 @lru_cache(maxsize=32)
 def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tuple[tuple[slice, slice], Points]:
-    """Return the region of a picture that contains texts, and the opacity of its pixels."""
+    """Return the region of a picture that contains the texts, and the opacity of the region's pixels."""
     from PIL import Image, ImageDraw
 
     mask = Image.new("L", shape[::-1])
@@ -192,7 +193,7 @@ class Scale:
 
     @classmethod
     def of(cls, name: str, values: NDArray, unit: str | None = None) -> "Scale":
-        """Give the ``unit`` of a quantity that is not in `UNITS`."""
+        """Fit a scale to ``values``. A quantity that is not in `UNITS` needs a ``unit``."""
         least, greatest = np.percentile(values, (0.5, 99.5))
         return cls(name, UNITS.get(name, "") if unit is None else unit, float(least), float(greatest))
 

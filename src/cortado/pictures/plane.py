@@ -53,7 +53,7 @@ class PlaneStage:
     picture: Picture
     container: BoxContainer | None
     lower: Points
-    """Lower corner (2,) [m] of the container, or of fluid and solids without a container."""
+    """Lower corner (2,) [m] of the container, or without a container of the fluid and the solids."""
     upper: Points
     spacing: float
     solids: tuple[ShownSolid, ...] = ()
@@ -270,7 +270,7 @@ class PlanePainter:
         return cover, np.clip(colour, 0.0, 1.0)
 
     def _wetting(self, positions: Points) -> tuple[Points, np.ndarray]:
-        """Return positions (m, 2) of particles and their images, and the particle number of each position."""
+        """Return positions (m, 2) [m] of particles and their mirror images, and the particle of each position."""
         stage, of, reach = self.stage, np.arange(len(positions)), 0.9 * self.stage.spacing
         lengths = np.zeros(2) if stage.container is None else stage.container.periods(2)[1]
         positions = stage.lower + wrapped(positions - stage.lower, lengths)

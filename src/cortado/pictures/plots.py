@@ -32,7 +32,7 @@ STYLE: dict[str, Any] = {
 
 @contextmanager
 def drawing(path: str | Path, width: float = 9.0, height: float = 5.2) -> Iterator[Any]:
-    """Sizes are in inches. The figure is saved if the ``with`` block ends without an error."""
+    """Open a figure of ``width`` and ``height`` [inch], which is saved if the ``with`` block ends without an error."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -55,7 +55,7 @@ def whole_numbers(axis: Any) -> None:
 
 
 def loss_curve(losses: ArrayLike, path: str | Path, *, label: str = "loss") -> Path:
-    """The axis of losses is logarithmic if any loss is positive."""
+    """Plot losses. The axis of the losses is logarithmic if any loss is positive."""
     values = np.asarray(losses, dtype=float)
     shown = np.isfinite(values)
     logarithmic = bool(np.any(values[shown] > 0.0))
@@ -89,7 +89,8 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot ``found`` (k, c) against ``x`` (k,). The curves ``true`` and ``start`` are (c,) or (k, c)."""
+    """Plot ``found`` (k, c) against ``x`` (k,). The curves ``true`` and ``start`` are arrays (k, c), or (c,) if
+    constant."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
     with drawing(path, height=1.6 + 1.9 * count) as figure:
@@ -111,10 +112,10 @@ def panels(
 
 
 def images(images: Iterable[ArrayLike], titles: Sequence[str], path: str | Path) -> Path:
-    """Images are linear colours (rows, columns, 3). More than four images form a grid."""
+    """Plot images of linear colours (rows, columns, 3). More than four images form a grid."""
     shown = [to_srgb(image) for image in images]
     if not shown or len(shown) != len(titles):
-        raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give at least one of each, paired.")
+        raise InputError(f"There are {len(shown)} images and {len(titles)} titles; give one title for each image.")
     across = len(shown) if len(shown) <= 4 else ceil(sqrt(len(shown)))
     down = -(-len(shown) // across)
     tallness = max(image.shape[0] / image.shape[1] for image in shown)
@@ -140,10 +141,10 @@ def particles(
     container: tuple[ArrayLike, ArrayLike] | None = None,
     lines: Sequence[ArrayLike] | None = None,
 ) -> Path:
-    """Plot particle sets (n, d) [m] side by side. In 3-D the view is along the z axis, with y upwards.      ``colours``
-    are linear colours (n, 3), or numbers (n,) on a scale that all panels share. Without colours, particles are
-    shaded by depth. ``container`` has two corners (d,) [m], and ``lines`` are end points (k, 2, d) [m] for each panel.
-    Above 150 000 particles, only every k-th particle is drawn."""
+    """Plot particle sets (n, d) [m] side by side. In 3-D the camera looks along the z axis, and y points up.
+    ``colours`` are linear colours (n, 3), or numbers (n,) on a colour scale of all panels. Without colours, particles
+    are shaded by depth. ``container`` has two corners (d,) [m]. ``lines`` (k, 2, d) [m] of each panel are end points of
+    lines. Above 150 000 particles, only every k-th particle is drawn."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 
@@ -186,8 +187,7 @@ def _bounds(sets: list[Points], container: tuple[ArrayLike, ArrayLike] | None) -
 
 
 def _colour_scale(sets: list[Points], colours: Sequence[NDArray | None]) -> tuple[list[NDArray], Any, str]:
-    """Return the colours (n, 3) of each panel, the colour bar's scale if particles have numbers, and which end of the
-    scale has numbers beyond it."""
+    """Return colours (n, 3) of each panel, the colour bar's scale or None, and "max" if values exceed the scale."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 

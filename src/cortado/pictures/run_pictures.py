@@ -45,7 +45,7 @@ Given = Scene | str | Path | None
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Return captions and paths. Film and contact sheet are "quick" unless the scene sets a quality."""
+    """Draw a run. Return captions and paths. Film and contact sheet have the scene's quality, by default "quick"."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -89,9 +89,9 @@ def _with_scale(stage: PlaneStage | Stage, scale: Scale) -> tuple[PlaneStage | S
 def shown_run(
     trajectory: Trajectory, scene: Scene, settings: Settings, units: Any = None, simulation: Computed = None
 ) -> ShownRun:
-    """``simulation`` computes quantities that colours need and that the run did not record."""
+    """Prepare a run for pictures. ``simulation`` computes the quantity of the colours if the run lacks the quantity."""
     if not len(trajectory):
-        raise InputError("The trajectory has no frames, but must have one to be filmed.")
+        raise InputError("The trajectory has no frames, but a film needs at least one.")
     known = dict.fromkeys(trajectory.others, "") if units is None else units
     scene = shown_as(scene, settings, known)
     unit = known.get((scene.picture or Picture()).colour)
@@ -128,7 +128,7 @@ def simulation_picture(simulation: Simulation, frame: Frame, settings: Settings)
 
 def simulation_film(simulation: Simulation, trajectory: Trajectory, path: str | Path, settings: Settings) -> Film:
     if not isinstance(trajectory, Trajectory):
-        raise InputError(f"trajectory is {shown(trajectory)}, but must be one, as simulation.run returns it.")
+        raise InputError(f"trajectory is {shown(trajectory)}, but must be a Trajectory from simulation.run.")
     units = _units_of_fields(simulation)
     run = shown_run(trajectory, simulation.scene, settings, units, lambda: simulation)
     return film_of(run, path, simulation.device)
@@ -155,7 +155,7 @@ def device_of(name: str) -> Any:
 def _scene_of(trajectory: Trajectory, given: Given) -> Scene:
     found = trajectory.scene if given is None else as_scene(given)
     if found is None:
-        raise InputError("The trajectory is from a file, which has no scene: give it, as scene=scene.")
+        raise InputError("The trajectory is from a file, which has no scene: give the scene, as scene=scene.")
     return found
 
 
@@ -189,7 +189,7 @@ def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> 
 
 
 def density_errors(trajectory: Trajectory, path: str | Path, *, tolerance: float | None = None) -> Path:
-    """Plot the density error [%] and the iterations of each solver loop, and mark steps without convergence."""
+    """Plot the density error [%] and the iterations of each solver loop. Mark steps that did not converge."""
     steps = np.arange(1, len(trajectory.converged) + 1)
     loops = {name: column for name, column in trajectory.diagnostics.items() if column.dtype.kind == "i"}
     errors = 100.0 * trajectory.density_errors

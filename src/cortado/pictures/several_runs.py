@@ -66,7 +66,7 @@ def film_side_by_side(
     each = list(given)
     for run in each:
         if not isinstance(run, Trajectory):
-            raise InputError(f"runs has {shown(run)}, but must have trajectories, as simulation.run returns them.")
+            raise InputError(f"runs contains {shown(run)}, but must contain trajectories from simulation.run.")
     if scenes is not None and len(scenes) != len(each):
         raise InputError(f"scenes has {len(scenes)} scenes, but must have one for each of {len(each)} runs.")
     known = [run.scene for run in each] if scenes is None else [as_scene(one) for one in scenes]
@@ -90,7 +90,7 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
         raise InputError("Some runs are in 2-D and some in 3-D, but all must have the same dimension.")
     for scene, run in zip(scenes, runs, strict=True):
         if not len(run):
-            raise InputError(f"The run of {scene.name} has no frames, but must have one to be shown.")
+            raise InputError(f"The run of {scene.name} has no frames, but a picture needs at least one.")
     alike = [scene.model_copy(update={"picture": scenes[0].picture}) for scene in scenes]
     found = [shown_as(scene, settings, run.others) for scene, run in zip(alike, runs, strict=True)]
     if missing := lacking(found[0]):
@@ -131,7 +131,7 @@ def _labelled(panel: Panel, name: str, shown: ShownFrames) -> Panel:
 
 
 def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return the times (frames,) [s] of a film. The frame interval is the shortest interval of all runs."""
+    """Return the times (frames,) [s] of a film. The interval between frames is the shortest interval of any run."""
     found = np.zeros(0)
     for times in sorted(each, key=lambda own: (interval_of(own), -len(own))):
         if not len(found):
@@ -180,8 +180,7 @@ class ShownFrames:
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """Return the names of the scenes, or the values that differ, such as ``viscosity = 0.1 Pa s``. If neither tells the
-    scenes apart, return ``otherwise``."""
+    """Return distinct names: of the scenes, by differing values as in ``viscosity = 0.1 Pa s``, or ``otherwise``."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]

@@ -20,7 +20,7 @@ FAR = 1e9
 
 
 def merged(vertices: Points, corners: Numbers) -> tuple[Points, Numbers, NDArray[np.bool_]]:
-    """Remove triangles without area. Also return a mask (t,) of the remaining triangles."""
+    """Remove triangles without area. Return vertices, triangles, and a mask (t,) of the remaining triangles."""
     whole = np.rint((vertices - vertices.min(axis=0)) / (1e-9 * np.ptp(vertices, axis=0).max()))
     _, first, number = np.unique(whole, axis=0, return_index=True, return_inverse=True)
     found = number.reshape(-1)[corners]
@@ -45,8 +45,8 @@ def unit(vectors: NDArray[Any]) -> Points:
 
 
 def cosines_of(vertices: Points, corners: Numbers) -> Points:
-    """Return cosines (t, 3) of the angles between normals of adjacent triangles. Side k is opposite to corner k. The
-    cosine     is -1 for sides without exactly one adjacent triangle."""
+    """Return cosines (t, 3) of the angles between normals of adjacent triangles. Side k is opposite to corner k. A side
+    of one triangle, or of more than two, has the cosine -1."""
     flat = unit(across_of(vertices, corners))
     _, which, counts = np.unique(np.sort(sides_of(corners), axis=1), axis=0, return_inverse=True, return_counts=True)
     which = which.reshape(-1)
@@ -77,16 +77,16 @@ class ShownSolid:
 
     @property
     def solid(self) -> Solid:
-        """Region that fluid cannot enter. For a tank, the region is the outside of its cavity."""
+        """Region that fluid cannot enter: the solid, or everything outside the cavity of a tank."""
         return Hollow(self.body) if self.is_tank else self.body
 
     def within(self, frame: Points, origin: Points) -> "ShownSolid":
-        """Convert the solid to axes with the rotation matrix ``frame`` (d, d) and the ``origin`` (d,) [m]."""
+        """Return the solid in axes with the rotation matrix ``frame`` (d, d) and the ``origin`` (d,) [m]."""
         return replace(self, position=frame @ (self.position - origin), turn=frame @ self.turn)
 
 
 def shown_solids(scene: Scene) -> tuple[ShownSolid, ...]:
-    """Include periodic images. Solids outside the periodic box are moved into the box."""
+    """Return all solids with their periodic images. Solids outside the periodic box are moved into the box."""
     found, domain = [], scene.domain
     for table in scene.solid:
         shape, is_tank = table.shown_shape(scene.discretisation.spacing), table.side == "inside"
@@ -122,7 +122,7 @@ def solid_outline(scene: Scene) -> Points:
 
 
 def own_faces(shown: ShownSolid) -> Faces:
-    """The middle of the solid is at the origin, and the solid is not rotated."""
+    """Return the faces of a solid without rotation whose middle is at the origin."""
     sizes = np.ptp(shown.shape.extent(), axis=0)
     return shown.shape.shown_faces(np.pi / 48 * float(max(sizes.min(), 0.25 * sizes.max())))
 
@@ -151,9 +151,9 @@ def _cut_by_plane(points: Points, corners: Numbers, axis: int) -> Points:
 
 
 def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points, Numbers, Numbers]:
-    """Cut the sides of triangles (t, 3) into parts of at most ``longest`` [m]. Also return the index of the original
-    triangle of each new triangle.      The number of parts is a power of 2, so adjacent triangles still share their
-    vertices. New sides inside a triangle     are at most sqrt(2) times as long as ``longest``."""
+    """Cut the sides of triangles (t, 3) into parts of at most ``longest`` [m]. Return vertices, new triangles, and the
+    index of the original triangle of each new triangle. The number of parts is a power of 2, so adjacent triangles
+    still share their vertices. New sides inside a triangle are at most sqrt(2) times as long as ``longest``."""
 
     def parts_of(sides: Numbers) -> Numbers:
         lengths = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1)
@@ -185,7 +185,7 @@ def refined(vertices: Points, corners: Numbers, longest: float) -> tuple[Points,
 
 
 def _cut(corners: Numbers, middles: Numbers, parents: Numbers) -> tuple[Numbers, Numbers]:
-    """``middles`` (t, 3) are new vertices on the sides opposite to each corner, or -1."""
+    """Divide triangles. ``middles`` (t, 3) are the new vertices on the sides opposite to the corners, or -1."""
     count, found, own = (middles >= 0).sum(axis=1), [], []
 
     def add(which: NDArray[np.bool_], *parts: tuple[Numbers, Numbers, Numbers]) -> None:
@@ -272,7 +272,7 @@ class SolidMesh:
 
 
 def _normals(corners: Numbers, across: Points) -> Points:
-    """Return mean normals (t, 3, 3) at corners, over the triangles that are not beyond a sharp edge."""
+    """Return normals (t, 3, 3) at corners: means over the triangles at a vertex whose normals are similar."""
     order = np.argsort(corners.ravel(), kind="stable")
     counts = np.bincount(corners.ravel())
     ends = np.cumsum(counts)

@@ -32,8 +32,7 @@ def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIO
 
 
 def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points]]) -> tuple[Points, Points]:
-    """Return the lower and the upper corner (d,) [m] of the region that shows the fluid. Drops that fall far away do
-    not     make the fluid look smaller."""
+    """Return the lower and the upper corner (d,) [m] of the region with the fluid, without distant drops."""
     first, *later = states
     found = [_ends(first, DROPS)]
     lower, upper = union([*found, *around])
@@ -48,14 +47,14 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return the corners (d,) [m] of positions without the outermost ``share`` along each axis."""
+    """Return the corners (d,) [m] of a box. Along each axis, a ``share`` of the positions is beyond each side."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
 
 def media_of(scene: Scene, size: float) -> tuple[Points, float]:
-    """Return scattering and absorption of each phase (phases, 2) [1/m], and the transparency. The transparency is the
-    mean     fraction of light that passes through fluid of the thickness `SPAN` times ``size`` [m]."""
+    """Return scattering and absorption of each phase (phases, 2) [1/m], and the transparency: the mean fraction of
+    light that passes through fluid of the thickness `SPAN` times ``size`` [m]."""
     picture, spacing = scene.picture or Picture(), scene.discretisation.spacing
     by_phase, transparency = picture.colour == "phase", picture.transparency
     own = by_phase and transparency is None and picture.surface == "liquid"
@@ -163,7 +162,7 @@ class Stage:
 
     @property
     def home_around(self) -> View:
-        """First view of a circling camera. Everything is visible from every side, unless a camera is given."""
+        """First view of a circling camera. By default the whole region is visible from every side."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])
@@ -174,7 +173,7 @@ class Stage:
         return View(*(self.frame.T @ place + self.origin for place in (eye, middle)))
 
     def at(self, pose: Scene | None, view: View | None) -> "Stage":
-        """Return the stage with the solids of ``pose`` and the camera at ``view``. An argument None changes nothing."""
+        """Return the stage with the solids of the scene ``pose`` and the camera ``view``. None changes nothing."""
         found = self
         if pose is not None:
             found = replace(found, solids=tuple(one.within(self.frame, self.origin) for one in shown_solids(pose)))
@@ -225,7 +224,7 @@ class Stage:
     @property
     def room(self) -> tuple[Points, Points]:
         """Corners (3,) [m] of the region in which fluid is shown, in container axes. The region is infinite along
-        periodic axes,         and upwards because emitters may be above the container."""
+        periodic axes, and also upwards, as emitters may be above the container."""
         lower, upper = (end.copy() for end in self.glass_ends)
         up = self.glass_frame @ (0.0, 1.0, 0.0)
         axis = int(np.abs(up).argmax())
@@ -238,7 +237,7 @@ class Stage:
 
     @property
     def panes(self) -> Points:
-        """Mask (2, 3) of panes of glass, for lower and upper sides (rows) along each axis (columns)."""
+        """Mask (2, 3) of the container's panes of glass. Rows are lower and upper sides, and columns are axes."""
         found = np.ones((2, 3))
         if isinstance(self.container, BoxContainer):
             found *= 1.0 - np.abs(self.frame) @ np.asarray(self.container.periodic, dtype=float)

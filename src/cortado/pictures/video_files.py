@@ -1,4 +1,4 @@
-"""Write films of linear images as H.264 videos in mp4, and as animated WebPs."""
+"""Write films of linear images as H.264 videos (mp4) or as animated WebPs."""
 
 from __future__ import annotations
 
@@ -38,14 +38,15 @@ class Video:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame that is shown from ``time`` [s] on. The last row or column of an odd number is repeated."""
+        """Add a frame from ``time`` [s] on. The last row or column is repeated if the number of rows or columns is
+        odd."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)
         self._shape = self._shape or pixels.shape
         if pixels.shape != self._shape:
             found = f"Frame {self.frames} of the video has shape {pixels.shape}"
-            raise InputError(f"{found}, but those before it {self._shape}.")
+            raise InputError(f"{found}, but must have the shape {self._shape} of the first frame.")
         rows, columns = (side % 2 for side in pixels.shape[:2])
         if rows or columns:  # yuv420p has a colour for 2 x 2 pixels
             pixels = np.pad(pixels, ((0, rows), (0, columns), (0, 0)), mode="edge")
@@ -76,7 +77,7 @@ class Video:
             self._container.mux(self._stream.encode())
 
     def _stream_of(self, width: int, height: int) -> Any:
-        """Return the video stream. No frame depends on a later frame, so that frames can be added to a copy."""
+        """Return the video stream. No frame depends on later frames, because `copy` appends frames."""
         if self._stream is None:
             most = BITS * (width * height / (1920 * 1080)) ** 0.75
             options = {"crf": VIDEO_QUALITY, "bf": "0", "maxrate": f"{most:.0f}", "bufsize": f"{4.0 * most:.0f}"}
@@ -100,7 +101,7 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
     ``frames_per_second`` is approximate: the file stores the exact time of each frame."""
     av, path = pyav(), Path(path)
     if path.suffix.lower() != ".mp4":
-        raise InputError(f"The film {path} must end in .mp4, or in .webp.")
+        raise InputError(f"The name of the film {path} must end in .mp4 or .webp.")
     if not 0.0 < frames_per_second < np.inf:
         raise InputError(f"frames_per_second is {frames_per_second}, but must be a positive number.")
     temporary = unfinished(path)
@@ -119,7 +120,7 @@ def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", c
                         os.replace(temporary, path)
                     raise
                 if not video.frames:
-                    raise InputError(f"The video {path} has no frames; give one at least.")
+                    raise InputError(f"The video {path} has no frames; add at least one.")
                 _end(video, container, file)
             os.replace(temporary, path)
         finally:
@@ -176,7 +177,7 @@ class Animation:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """The linear image (rows, columns, 3) is shown from ``time`` [s] on."""
+        """Add a linear image (rows, columns, 3) that is shown from ``time`` [s] on."""
         self._images.append(to_srgb(image))
         self._times.append(time)
         self.frames += 1
@@ -195,7 +196,7 @@ class Animation:
 
 @contextmanager
 def moving_picture(path: Path, frames_per_second: float, note: str = "", count: int = 0) -> Iterator[Video | Animation]:
-    """Open an animated WebP if the path ends in .webp, or else a video. An animation is written at the end of the
+    """Open an animated WebP for a path that ends in .webp, or else a video. The animation is written at the end of the
     ``with`` block, even after an interruption."""
     if path.suffix.lower() != ".webp":
         with writing(path, frames_per_second, note, count) as video:
@@ -209,5 +210,5 @@ def moving_picture(path: Path, frames_per_second: float, note: str = "", count: 
             write_atomically(path, animation.encoded())
         raise
     if not animation.frames:
-        raise InputError(f"The animation {path} has no frames; give one at least.")
+        raise InputError(f"The animation {path} has no frames; add at least one.")
     write_atomically(path, animation.encoded())

@@ -1,4 +1,4 @@
-"""Warp functions for everything around the fluid: lit surfaces, sky with lamps, floor, and glass container.
+"""Warp functions for the surroundings of the fluid: lit surfaces, sky with lamps, floor, and glass container.
 
 Coordinates are in picture axes with y upwards, and colours are linear.
 """
@@ -329,7 +329,7 @@ MILKY = wp.constant(wp.float32(0.07))
 
 @wp.struct
 class Passed:
-    """Light that glass adds to a ray, and the fraction of light that the glass transmits."""
+    """Light of the glass layers along a ray, and the fraction of light that passes through these layers."""
 
     light: wp.vec3
     through: wp.float32

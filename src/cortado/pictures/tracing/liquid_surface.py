@@ -86,7 +86,7 @@ REACH_OF_COLOURS = 2.25
 """Support radius of the kernel for the fluid's colour [spacings]."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
-"""Width of the lattice cubes [spacings], with the number of particles up to which the width applies."""
+"""Greatest number of particles, and width of the lattice cubes [spacings] up to this number."""
 WeightedLook = wp.types.vector(6, wp.float32)
 MOST_CELLS = 1 << 26
 """Greatest number of cells in the grid that finds near particles."""
@@ -96,7 +96,7 @@ WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
 DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
 """Factors that reduce the volumes of isolated particles and of particles in thin sheets."""
 FILLED = wp.constant(wp.vec3(0.45, 0.6, 0.85))
-"""Fraction of space that particles fill around isolated particles, in thin sheets, and in bulk fluid."""
+"""Fraction of space that particles fill: around isolated particles, in thin sheets, and in bulk fluid."""
 FULL = wp.constant(wp.float32(2.84))
 """Weighted number of neighbours above which a particle is not in a thin sheet."""
 
@@ -175,11 +175,11 @@ def find_sizes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: Fl
 
 
 Level = tuple[Any, wp.array]
-"""`Blocks`, and the numbers of the blocks that may contain the surface."""
+"""A density as `Blocks`, and the indices of the blocks that may contain the surface."""
 
 
 def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0) -> tuple[Level, Any]:
-    """The cubes of the lattice are at least ``least`` particle spacings wide."""
+    """Return the density of fluid. The cubes of the lattice are at least ``least`` particle spacings wide."""
     reach, ends = REACH * spacing, _shown(particles, spacing, launch)
     cube = max(next(width for most, width in CUBE_WIDTHS if len(particles) <= most), least)
     s = near_particles(particles, ends, spacing, reach, launch)
@@ -194,7 +194,7 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, lea
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
-    """The smoothing preserves thin sheets (Löschner et al. 2023). Raises `ComputationError` without a surface."""
+    """Return a smooth surface with thin sheets (Löschner et al. 2023). Raises `ComputationError` without a surface."""
     device, reach = launch.device, REACH * spacing
     if level is None:
         level, s = liquid_level(particles, spacing, launch, least)
@@ -203,7 +203,7 @@ def liquid_surface(
     net = net_of(*level, launch)
     points, count = net.points, len(net.points)
     if not count:
-        raise ComputationError("The fluid has no surface to draw: its particles are too far from each other.")
+        raise ComputationError("The fluid has no surface to draw, as the particles are too far from each other.")
     weights, colours = wp.empty(count, dtype=wp.float32, device=device), wp.empty_like(points)
     media = wp.empty(count, dtype=wp.vec2, device=device)
     launch(find_weights, count, s=s, reach=reach, points=points, weights=weights)

@@ -36,7 +36,7 @@ AT_ONCE = 8000
 
 
 def mixed(fractions: Points, values: Points) -> Points:
-    """Mix ``values`` of phases (phases, c) by mass ``fractions`` (n, phases) into values (n, c)."""
+    """Return the means (n, c) of the phases' ``values`` (phases, c), weighted by mass ``fractions`` (n, phases)."""
     found, shares = np.empty((len(fractions), values.shape[1])), np.clip(fractions, 0.0, 1.0)
     for first in range(0, len(shares), AT_ONCE):
         np.matmul(shares[first : first + AT_ONCE], values, out=found[first : first + AT_ONCE])
@@ -48,7 +48,7 @@ class Particles:
     places: wp.array
     """Positions of the particles (n,) as vec3 [m]."""
     looks: wp.array
-    """Colour, scattering and absorption of each particle (n,) as `Look`."""
+    """A `Look` of each particle (n,): colour, scattering and absorption."""
 
     @classmethod
     def on(cls, device: Any, places: Points, colours: Points, media: ArrayLike = OPAQUE) -> "Particles":
@@ -67,7 +67,7 @@ class Particles:
         return len(self.places)
 
     def ends(self, launch: BandLauncher) -> tuple[Points, Points]:
-        """Return the lower and the upper corner (3,) [m] of a box around the particles."""
+        """Return the lower and the upper corner (3,) [m] of the smallest box around the particles."""
         count, device = min(PARTS, len(self)), self.places.device
         lower, upper = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
         launch(find_ends, count, places=self.places, lower=lower, upper=upper)
@@ -139,8 +139,8 @@ def bump_at(q: float) -> float:
 
 @cache
 def sum_near(term: Callable[..., Any], number: Any) -> Any:
-    """Make a Warp function with the arguments ``(s, p, reach)``. The function sums ``term(s, j)`` over the particles j
-    within ``reach`` [m] of the point p, with `bump` as the weight. ``number`` is the Warp type of ``term``."""
+    """Return a Warp function of ``(s, p, reach)`` that sums ``term(s, j)`` over the particles j within ``reach`` [m] of
+    the point p, with `bump` as the weight. ``number`` is the Warp type of ``term``."""
 
     @wp.func
     def summed(s: NearParticles, p: wp.vec3, reach: wp.float32):
@@ -192,7 +192,7 @@ def find_volumes(first: wp.int32, s: NearParticles, reach: wp.float32, volumes: 
 def near_particles(
     given: Particles, ends: tuple[np.ndarray, np.ndarray], spacing: float, reach: float, launch: BandLauncher
 ) -> Any:
-    """Sort the particles in the box ``ends`` (3,) [m] for sums within ``reach`` [m] of a point."""
+    """Sort the particles in the box ``ends`` (3,) [m] into cells, for sums within ``reach`` [m] of a point."""
     device, lower = launch.device, np.floor(ends[0] / spacing) * spacing
     x, y, z = (int(n) + 1 for n in np.floor((ends[1] - lower) / spacing))
     sorting = CellSort(Grid(lower, np.full(3, spacing), (x, y, z)), len(given), FLOAT32, device)

@@ -41,7 +41,7 @@ class SolidHit:
     t: wp.float32
     """Distance along the ray, or FAR without a hit."""
     is_cut: wp.bool
-    """True for a hit on the cut of a solid by a container wall."""
+    """True if the ray hits the plane at which a container wall cuts a solid."""
     face: wp.int32
     u: wp.float32
     v: wp.float32
@@ -104,7 +104,7 @@ def shaded_solid(s: Environment, met: SurfaceHit, d: wp.vec3, glossy: wp.float32
 
 @wp.func
 def clear_layers(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, spread: wp.float32, before: Passed):
-    """``most`` [m] is the greatest distance along the ray, and ``before`` is the light of nearer layers."""
+    """Add transparent solids behind the nearer layers ``before``, up to the distance ``most`` [m] along a ray."""
     passed = before
     start = s.nearest
     for _ in range(LAYERS):
@@ -142,7 +142,7 @@ def wall_hit(s: Environment, t: wp.float32, normal: wp.vec3):
 
 @wp.func
 def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before: Passed):
-    """``most`` [m] is the greatest distance along the ray, and ``before`` is the light of nearer layers."""
+    """Add an opaque wall behind the nearer layers ``before``, up to the distance ``most`` [m] along a ray."""
     part = within_walls(s, o, d)
     t = part[1]
     if t <= wp.max(part[0], s.nearest) or t >= most:
@@ -160,7 +160,7 @@ def opaque_wall(s: Environment, o: wp.vec3, d: wp.vec3, most: wp.float32, before
 
 @wp.func
 def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
-    """The point ``q`` is in container axes, and ``before`` is the light of nearer layers."""
+    """Add a flat pane at the point ``q``, in container axes, behind the nearer layers ``before``."""
     axis, side, _distance = nearest_side(s, q, s.glass_lower, s.glass_upper)
     off = FAR
     for a in range(3):
@@ -174,7 +174,7 @@ def box_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: 
 
 @wp.func
 def tube_side(s: Environment, q: wp.vec3, d: wp.vec3, width: wp.float32, before: Passed):
-    """The point ``q`` is in container axes, and ``before`` is the light of nearer layers."""
+    """Add a round pane at the point ``q``, in container axes, behind the nearer layers ``before``."""
     if q[1] < s.glass_lower[1] or q[1] > s.glass_upper[1]:
         return before
     x = 0.5 * (s.glass_lower[0] + s.glass_upper[0])

@@ -57,7 +57,7 @@ class DeviceSurface:
 
 
 FINE, FINE_OWN = 0.03, 0.05
-"""Greatest width of the faces of round solids, relative to the contents and relative to the solid."""
+"""Greatest width of the faces of round solids, as fractions of `Stage.size` and of the solid's size."""
 LONGEST = 0.04
 """Greatest side of a triangle at whose corners light is computed, as a fraction of `Stage.size`."""
 MODULE = kernel_module("shadow")
@@ -124,7 +124,7 @@ def kept_off(above: wp.vec4, layer: wp.float32, opacity: wp.float32, tinted: wp.
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def darken(first, key, around, strength, layer, opacity, tinted, begin, light):
-    """Reduce ``light`` in place, by the shadow of the lamp and by the shadow of the sky."""
+    """Darken ``light`` in place by two shadows of an object: from the lamp and from the sky."""
     n = first + wp.tid()
     i = n / key.shape[1]
     j = n % key.shape[1]
@@ -184,7 +184,7 @@ class FloorShadow:
         self._launch(darken, key.size, key=key, around=around, **how, begin=seen["begin"], light=self.light)
 
     def _reached(self, parts: Particles, slope: Points, around: int) -> tuple[list[int], tuple[int, int]]:
-        """Return the first floor node under the shadow of an object, and the number of nodes along each axis."""
+        """Return the first node of the shadow of ``parts`` on the floor, and the number of nodes along each axis."""
         lower, upper = (end - self.corner for end in parts.ends(self._launch))
         shifts = np.outer((0.0, lower[1], upper[1]), slope)
         first = np.floor((lower[::2] - shifts.max(axis=0)) / self.cell) - around

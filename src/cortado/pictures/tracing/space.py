@@ -1,4 +1,4 @@
-"""Draws pictures of fluid in 3-D with a ray tracer.
+"""Draw pictures of fluid in 3-D with a ray tracer.
 
 Particles near walls and solids get mirror images behind the wall, so that the fluid is drawn without a gap.
 """
@@ -41,18 +41,18 @@ from cortado.scene.scene import Scene
 SKIN = 0.7
 """Approximate distance from a particle to the drawn surface [spacings]."""
 DEPTHS = (1.0, 0.7, 0.4, 0.1)
-"""Depths of a mirror image, relative to the particle's distance from the surface. The first depth that hides the image
-inside the solid is used."""
+"""Depths of a mirror image, relative to the particle's distance from the surface, in order of preference. An image must
+be hidden inside the solid."""
 ON_SURFACE = 0.05
-"""Greatest distance of a point from a surface at which it counts as on the surface [spacings]."""
+"""Tolerance [spacings] for points on the surface of a solid."""
 SAME_SIDE = 0.8
 """Cosine of the angle between two normals of a solid, above which both normals belong to the same side."""
 
 
 def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing: float) -> tuple[Points, np.ndarray]:
     """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the index of each original point (m,).
-    A point has an image behind each side nearer than ``near`` [m], and behind corners between these sides. Behind a
-    thin     solid the image is closer to the surface or left out."""
+    Sides of solids within ``near`` [m] of a point, and corners between such sides, mirror the point. In thin solids an
+    image is nearer to the surface, or missing."""
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
     for shown in solids:
@@ -98,7 +98,7 @@ def turn(first: wp.int32, frame: wp.mat33, places: Vec3s):
 def particles_of(
     stage: Stage, positions: np.ndarray, colours: np.ndarray, launch: BandLauncher, fractions: Points | None = None
 ) -> Particles:
-    """``positions`` (n, 3) [m] are in scene axes, and the returned particles are in picture axes."""
+    """Convert ``positions`` (n, 3) [m] in scene axes to particles in picture axes."""
     media = stage.media.mean(axis=0) if fractions is None else mixed(fractions, stage.media)
     places = stage.container.domain(3).wrapped(positions)
     found = Particles.on(launch.device, np.subtract(places, stage.origin), colours, media)
@@ -125,7 +125,7 @@ def images_along(s: Environment, q: wp.vec3, axis: wp.int32, spacing: wp.float32
 
 @wp.func
 def image_along(s: Environment, q: wp.vec3, axis: wp.int32, which: wp.int32, spacing: wp.float32):
-    """Return the vector from a particle at ``q`` to a mirror image along an axis."""
+    """Return the vector from a particle at ``q`` to its mirror image number ``which`` along an axis."""
     way = wp.vec3(0.0)
     if which == 0:
         return way
@@ -289,7 +289,7 @@ class SpacePainter:
             return self._rays(*self.scenery(state, steadied(own, before, after, self.stage.spacing, self._launch)))
 
     def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
-        """A `Still` in ``steady`` provides an averaged surface and an averaged shadow."""
+        """Return the parts of a picture. An averaged frame ``steady`` replaces the state's surface and shadow."""
         stage, s, particles, shadow = self._placed(state)
         if steady is None:
             shadow.of_fluid(particles)

@@ -1,4 +1,4 @@
-"""Averages the drawn surface over frames of a film, so that fluid at rest does not flicker.  Particles of fluid at rest
+"""Average the drawn surface over frames of a film, because fluid at rest would flicker. Particles of fluid at rest
 drift by fractions of a spacing. In each block of the lattice, the change of the mean density measures how far the fluid
 moves between frames. Moving fluid and drops are drawn unchanged."""
 
@@ -24,12 +24,12 @@ from cortado.pictures.tracing.near_particles import (
 from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at, index_of, place_of
 
 WINDOW, SHADOW_WINDOW = 30, 6
-"""Numbers of frames in an average, before a frame and again after it: for the surface, and for the shadow."""
+"""Greatest numbers of frames on each side of the averaged frame: for the surface, and for the shadow."""
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
-"""Pairs of limits for the displacement [spacings], the change of density and the change of light. Below the first limit
-a frame has full weight. Above the second limit its weight is 0."""
+"""Two limits each for the displacement [spacings], the change of density, and the change of light between frames. Below
+the first limit a frame has full weight. Above the second limit its weight is 0."""
 BODY_REACH, BODY = 6.0, wp.constant(wp.vec2(7.0, 12.0))
-"""Distance for counting particles around a block [spacings], and the counts for a drop and for bulk fluid."""
+"""Distance [spacings] within which particles around a block count, and the counts for a drop and for bulk fluid."""
 TOUCHING = wp.constant(27)
 
 
@@ -43,14 +43,14 @@ class Still:
     means: Floats
     """Mean density of the fluid in each block (blocks,)."""
     bodies: Floats
-    """Measure of each block's fluid, from 0 for drops to 1 for bulk fluid (blocks,)."""
+    """Kind of fluid around each block (blocks,), from 0 for drops to 1 for bulk fluid."""
     light: Vec3s2d
     """Light at each node of the floor (nodes, nodes)."""
 
 
 @wp.func
 def nearness(j: wp.int32, before: wp.int32, window: wp.int32):
-    """The weight decreases with the number of frames between frame ``j`` and the averaged frame."""
+    """Return a weight that decreases with the number of frames between frame ``j`` and the averaged frame."""
     away = wp.where(j < before, j, j - before) + 1
     return 1.0 - float(away) / float(window + 1)
 
@@ -87,7 +87,7 @@ def find_means(first, own, s, reach, means, bodies):
 @wp.kernel(module=MODULE, enable_backward=False)
 @typed
 def find_ways(first, own, others, width, touching, indices, ways):
-    """Compute how far the fluid in each block moved between two frames [spacings]."""
+    """Compute the distance [spacings] that the fluid in each block moved between two frames."""
     n = first + wp.tid()
     at = block_at(own.b, own.blocks[n])
     for k in range(TOUCHING):
@@ -180,7 +180,8 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """Average a frame with the frames ``before`` and ``after`` it, each list sorted from the nearest frame."""
+    """Average the frame ``own`` with earlier frames ``before`` and later frames ``after``, both in order of
+    distance."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

@@ -1,6 +1,7 @@
-"""The isosurface of a density, as a net with one corner in each lattice cube that the surface crosses (Gibson 1998).
-The density is called level. The lattice is divided into blocks of `WIDTH` cubes along each axis, and the level is
-computed only in blocks that may contain the surface. The net has a quadrilateral for each crossed edge of a cube."""
+"""The isosurface of a fluid density as a surface net of quadrilaterals (Gibson 1998). The net has one corner in each
+lattice cube that the surface crosses, and a quadrilateral for each crossed edge of a cube. Blocks of `WIDTH` cubes
+along each axis divide the lattice. Names with ``level`` stand for the density, which is computed only in blocks that
+may contain the surface."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -83,7 +84,7 @@ def entry_of(b: Blocks, node: wp.vec3i):
 
 @wp.func
 def level_at(b: Blocks, node: wp.vec3i):
-    """Where no density was computed, return the density at the corner of the node's block."""
+    """Return the density at a node. In blocks without a surface, return the density at the block's corner."""
     entry = entry_of(b, node)
     if entry < 0:
         return b.corners[node[0] / WIDTH, node[1] / WIDTH, node[2] / WIDTH]
@@ -155,8 +156,8 @@ def find_levels(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks,
 def level_blocks(
     s: Any, ends: tuple[np.ndarray, np.ndarray], cube: float, reach: float, launch: BandLauncher
 ) -> tuple[Any, wp.array]:
-    """Return the density in the box ``ends`` (3,) [m], extended by ``reach`` [m]. Also return the indices of the blocks
-    that     may contain the surface."""
+    """Return the density in the box ``ends`` (3,) [m], extended by ``reach`` [m], and the indices of the blocks that
+    may contain the surface."""
     device, wide = launch.device, WIDTH * cube
     low, high = np.floor((ends[0] - reach) / wide), np.ceil((ends[1] + reach) / wide)
     b, shape = Blocks(), (high - low).astype(int)
@@ -384,7 +385,7 @@ def normals_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.ar
 
 
 def triangles_of(net: SurfaceNet, points: wp.array, launch: BandLauncher) -> wp.array:
-    """Return indices of net corners (3 t,), three for each triangle."""
+    """Return indices (3 t,) of the net corners at the corners of t triangles."""
     found = wp.empty(6 * net.sides, dtype=wp.int32, device=launch.device)
     launch(list_triangles, len(net.cube_signs), cubes=net.cubes, signs=net.cube_signs, points=points, triangles=found)
     return found

@@ -2,7 +2,8 @@
 
 Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light is scattered light. Scattered light has
 the fluid's colour and the brightness of the light on the fluid's surface. The remaining light is multiplied by
-colour^(absorption L), by the Beer-Lambert law. The optical properties at the entry point are used along the whole ray.
+colour^(absorption L), by the Beer-Lambert law. Along the whole ray, the fluid has the optical properties of the point
+at which the ray enters.
 """
 
 from functools import cache
