@@ -1,4 +1,4 @@
-"""How Sphinx builds the site from this folder: `make docs`."""
+"""Settings of Sphinx, which builds the site from this folder: `make docs`."""
 
 import logging
 import os

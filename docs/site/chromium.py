@@ -1,4 +1,4 @@
-"""Chromium without a window, for looking at pages: the site's, a report's, the viewer's. Needs Playwright."""
+"""Chromium without a window, for checks of the site, of reports and of the viewer. Needs Playwright."""
 
 import shutil
 from collections.abc import Iterator
@@ -6,13 +6,13 @@ from contextlib import contextmanager
 from typing import Any
 
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-"""So that WebGL is drawn also where there is no GPU."""
+"""Options of Chromium that draw WebGL on a CPU."""
 
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """A browser: the installed one, or Playwright's own where the command is not found. Raises `ImportError` without
-    Playwright, and Playwright's ``Error`` without a browser."""
+    """Open the installed Chromium, or Playwright's Chromium if the command ``chromium`` is missing. Raises
+    `ImportError` without Playwright, and Playwright's ``Error`` without a browser."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -24,7 +24,7 @@ def chromium() -> Iterator[Any]:
 
 
 def listened(page: Any) -> list[str]:
-    """What goes wrong on a page from now on: errors in its console or in its scripts, and files that do not come."""
+    """Return a list that grows with the page's errors: in the console, in scripts, and for files that do not load."""
     found: list[str] = []
     page.on("console", lambda message: found.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: found.append(str(error)))

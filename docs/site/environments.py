@@ -2,8 +2,8 @@
 
     python docs/site/environments.py
 
-It takes two minutes on a core. ``--only Raft`` draws those alone, for a try; ``--size large --device cuda:0`` has finer
-fluids, for a GPU.
+The script needs two minutes on one core. ``--only Raft`` draws one environment, as a test.
+``--size large --device cuda:0`` draws finer fluids on a GPU.
 """
 
 import argparse
@@ -25,12 +25,12 @@ TIMES = 0.05, 0.35, 0.65
 
 
 def carried(part: float) -> list[float]:
-    """Speed up, slow down, and lean back against both."""
+    """Accelerate, slow down, and tilt against both accelerations."""
     return [sin(2.0 * pi * min(part, 0.5)), 0.25 * cos(2.0 * pi * part) if part < 0.5 else 0.0]
 
 
 def poured(part: float) -> list[float]:
-    """Turn until the jug lies on its side, and a little more."""
+    """Turn the jug until it lies on its side, and a little further."""
     return [0.3, -1.0 if part < 0.42 else 0.0]
 
 
@@ -44,7 +44,7 @@ ACTIONS: dict[str, Callable[[float], list[float]]] = {
     "CarryInSpace": carried,
     "PourInSpace": poured,
 }
-"""Actions by the name of the task, as functions of the part of an episode that is over."""
+"""Functions by task name. Each returns an action for the elapsed fraction of an episode."""
 
 
 def row(name: str, size: str, device: str) -> np.ndarray:

@@ -4,7 +4,8 @@
     python docs/site/gallery.py --only honey --only jug
 
 ``--coarser 3 --part 0.1`` draws the first tenth of each film with spacings three times as wide, for a try on a CPU.
-Several films are made in processes of their own, some at a time; one that fails stops no other. Runs are not kept.
+Each of several films has its own process, with ``--at-a-time`` processes in parallel. A failed film does not stop the
+other films. The script deletes the runs.
 """
 
 import argparse
@@ -19,34 +20,34 @@ from tempfile import TemporaryDirectory
 
 FIGURES, TEMPLATES = (Path(__file__).parents[2] / folder for folder in ("docs/figures", "src/cortado/cli/templates"))
 FRAMES, LASTS = 72, 3.6
-"""Of a film, and how many seconds it takes to see them."""
+"""Number of frames of a film, and duration of the film [s]."""
 PICTURE = ("picture.width=640", "picture.height=360")
 ORBIT = "picture.camera_path={kind = 'orbit', turns = 0.25}"
 NEW = ("solver.time_step=auto",)
-"""Scenes have steps for wider spacings."""
+"""Setting for scenes whose time step is too long for the film's spacing."""
 
 MIXED = "mixture={free_energy = 'miscible', mobility = 5e-7, mobility_form = 'constant'}"
-"""Milk and coffee that mix by Fick's law, where single particles of either would be dots."""
+"""Setting with which milk and coffee mix by Fick's law. Without the setting, single particles look like dots."""
 DROP = "fluid.1.velocity=[0, -1.2, 0]", "phase.0.viscosity=0.05", "phase.1.viscosity=0.05", "picture.field_of_view=21"
-"""One that is slow enough for its crown to hold together."""
+"""Settings for a slow splash whose crown stays in one piece."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A film, and a picture out of it."""
+    """A film, and a picture from the film."""
 
     scene: Path
     spacing: float
-    """[m] between particles, finer than in the scene."""
+    """Particle spacing [m], finer than in the scene."""
     seconds: float
-    """That are simulated."""
+    """Simulated time [s]."""
     still: float
-    """When the picture is taken: 0 is the start, 1 the end."""
+    """Moment of the picture, from 0 at the start of the film to 1 at the end."""
     values: tuple[str, ...] = ()
-    """That replace those of the scene, as ``--set`` does."""
+    """Values that replace values of the scene, in the syntax of ``--set``."""
 
     def draw(self, name: str, folder: Path, run: Path, device: str, coarser: float, part: float) -> None:
-        """Run the scene into a folder, and write the picture and the film into another."""
+        """Write the run into the folder ``run``, and the picture and the film into ``folder``."""
         from PIL import Image
 
         from cortado.cli.existing_runs import draw_runs
@@ -90,7 +91,7 @@ ENTRIES = {
 
 
 def main() -> int:
-    """Draw those that are asked for; returns how many failed."""
+    """Draw the films of ``--only``, by default all films, and return the number of failures."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", action="append", choices=ENTRIES, help="one of them; may be given again")
     parser.add_argument("--out", type=Path, default=Path("runs/gallery"))

@@ -1,8 +1,8 @@
 """Look at every page of the built site in Chromium: ``python docs/site/look.py build/docs [--pictures FOLDER]``.
 
-A page fails if its console has an error, if a file that it needs does not come, if it is wider than the window, if a
-table on a telephone breaks a short entry into lines, if a picture has no description, or if one does not show.
-Chromium has to be installed; where its command is not found, Playwright's own is taken.
+A page fails if the console shows an error, a file does not load, the page is wider than the window, a table on a
+telephone breaks a short entry into lines, or a picture is missing or has no description. The script needs Chromium,
+installed or from Playwright.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from typing import Any
 from chromium import chromium, listened
 
 WIDTHS = (390, 1280)
-"""Of a telephone, and of a laptop [pixels]."""
+"""Width of the window [pixels] on a telephone, and on a laptop."""
 PICTURED = ("index", "start", "performance", "scene_file", "adjoint", "api/gradients", "tutorials/first_splash")
 LOOK = """() => {
   const found = [];
@@ -35,7 +35,7 @@ LOOK = """() => {
 
 
 def complaints(browser: Any, page_file: Path, width: int, picture: Path | None) -> Iterator[str]:
-    """What is wrong with a page in a window of a width."""
+    """Yield the errors of a page in a window of ``width`` pixels."""
     page = browser.new_page(viewport={"width": width, "height": 800})
     found = listened(page)
     page.goto(page_file.resolve().as_uri(), wait_until="load")
@@ -49,7 +49,7 @@ def complaints(browser: Any, page_file: Path, width: int, picture: Path | None) 
 
 
 def main() -> None:
-    """Exit code 1 where there are complaints."""
+    """Check all pages. The exit code is 1 if a page has errors."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("site", type=Path)
     parser.add_argument("--pictures", type=Path, help="folder for pictures of some pages")

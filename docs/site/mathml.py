@@ -1,4 +1,4 @@
-"""Equations as MathML, which browsers draw themselves: the site needs no script, and no network, for them."""
+"""Write equations as MathML, which browsers draw without a script or a network."""
 
 import re
 from typing import Any
@@ -15,7 +15,7 @@ _PRIMED = re.compile(r"<msup>(<mi>[^<]*</mi>)<mi>(&#x0203[234];)</mi></msup>")
 
 
 def mathml(text: str, display: str) -> str:
-    """A formula in LaTeX as MathML."""
+    """Convert a LaTeX formula to MathML."""
     # What is over a letter is an accent, such as a bar, and as large as the letter.
     found = convert(text, display=display).replace("<mover>", '<mover accent="true">')
     # Primes are raised already; as superscripts they would be too small to see.

@@ -1,6 +1,6 @@
-"""Pages of the repository that stand outside of this folder are pages of the site too, with links that lead to them.
+"""Add pages of the repository outside this folder to the site, and adapt links to these pages.
 
-Each is read where it is: the page that Sphinx knows is empty but for its name, and its text comes from the other file.
+For each outer page, the folder has a stub with the page's name. Sphinx reads the outer page in place of the stub.
 """
 
 import re
@@ -17,7 +17,7 @@ OUTER = {
     "benchmarks": "benchmarks/README.md",
     "experiments": "experiments/README.md",
 }
-"""By the page's name the file, seen from the root of the repository."""
+"""Path of the outer page in the repository, by the name of the page in the site."""
 LINK = re.compile(r"\]\(([^)\s#:]+)(#[^)\s]*)?\)")
 
 
@@ -32,7 +32,7 @@ def _read(app: Any, name: str, source: list[str]) -> None:
 
 
 def _towards(link: re.Match[str], folder: Path, page: Path) -> str:
-    """A link as it has to be on the page, where it leads to a file that another page shows."""
+    """Return a link. A link to a file that the site shows as a page leads to this page."""
     target = (folder / link[1]).resolve()
     found = next((f"{name}.md" for name, file in OUTER.items() if ROOT / file == target), None)
     docs = ROOT / "docs"

@@ -6,7 +6,7 @@ HEAD = "| parameter | shape | unit | | range |\n|---|---|---|---|---|\n"
 
 
 def markdown() -> str:
-    """Return a Markdown table with a row for each parameter; n particles, d dimensions, in a run of several steps."""
+    """Return a Markdown table with a row for each parameter. Shapes contain n particles and d dimensions."""
     return HEAD + "".join(_row(parameter) for parameter in PARAMETERS)
 
 

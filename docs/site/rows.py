@@ -1,4 +1,4 @@
-"""A table of a file as a table for people: what the JSON schema of its model says, in Markdown."""
+"""Tables in Markdown that describe the keys of a TOML table, from the JSON schema of the table's model."""
 
 import json
 import re
@@ -9,11 +9,11 @@ from cortado.scene.tables import GREATEST
 
 Schema = Mapping[str, Any]
 Row = tuple[str, str, str, str]
-"""Of a key its name, what it is, its value if it is left out, and its meaning."""
+"""Name of a key, its type, its default, and its meaning."""
 WORDS = {"number": "number", "integer": "whole number", "boolean": "`true` or `false`", "string": "text"}
 HEAD = "| key | what it is | if left out | meaning |\n|---|---|---|---|\n"
 TAGS = ("shape", "kind")
-"""Keys that say which of several tables one is."""
+"""Keys whose value selects one of several tables."""
 
 
 def rows(
@@ -21,7 +21,7 @@ def rows(
     links: Mapping[str, tuple[str, str]] | None = None,
     defaults: Mapping[str, str] | None = None,
 ) -> str:
-    """A table with a row for each key.
+    """Return a table with a row for each key.
 
     Args:
         schema: that of the table, part of `model_json_schema()`.
@@ -35,13 +35,13 @@ def rows(
 
 
 def rows_of(schema: Schema, links: Mapping[str, tuple[str, str]]) -> dict[str, Row]:
-    """The row of each key, by its name."""
+    """Return the row of each key, by the name of the key."""
     needed = [*schema.get("required", []), "shape"]
     return {key: _row(key, field, key in needed, links.get(key)) for key, field in schema["properties"].items()}
 
 
 def shown(found: Iterable[Row]) -> str:
-    """Rows as a table in Markdown; nothing where there is none."""
+    """Return rows as a Markdown table, or an empty text without rows."""
     lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |\n" for row in found]
     return HEAD + "".join(lines) if lines else ""
 
@@ -49,9 +49,9 @@ def shown(found: Iterable[Row]) -> str:
 def split(
     schemas: Iterable[Schema], links: Mapping[str, tuple[str, str]] | None = None
 ) -> tuple[list[Row], list[list[Row]]]:
-    """The rows that several tables have alike, each once, and of every table the others.
+    """Return the rows that several tables share, each row once, and the other rows of each table.
 
-    A row that some of the tables lack says which have it. The key that tells the tables apart is one row.
+    A shared row that some tables lack names the tables with this row. The key that selects a table gives one row.
     """
     tables = [rows_of(schema, links or {}) for schema in schemas]
     tags = [key for key in TAGS if key in tables[0]]
@@ -66,14 +66,14 @@ def split(
 
 
 def _tag_row(found: Sequence[Row]) -> Row:
-    """The rows of the key that tells tables apart as one; a default is one where a single table has it."""
+    """Join rows of the key that selects a table into one. The row shows a default if only one table has a default."""
     defaults = {default for _, _, default, _ in found} - {"*needed*"}
     names = listed([name for _, name, _, _ in found])
     return found[0][0], names, defaults.pop() if len(defaults) == 1 else "*needed*", "Which of them it is."
 
 
 def _of_some(meaning: str, having: Sequence[str], names: Sequence[str]) -> str:
-    """A meaning with the names of the tables that have the key, or of the fewer ones that lack it."""
+    """Add the names of the tables with the key to a meaning, or the fewer names of the tables without the key."""
     lacking = [name for name in names if name not in having]
     if not lacking:
         return meaning
@@ -82,7 +82,7 @@ def _of_some(meaning: str, having: Sequence[str], names: Sequence[str]) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """One or the other of some names, in words."""
+    """Join names with commas and "or"."""
     return " or ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
 
 
@@ -157,7 +157,7 @@ def _default(field: Schema, needed: bool) -> str:
 
 
 def _meaning(key: str, field: Schema, unit: str) -> str:
-    """Without its shape and unit, which other columns have."""
+    """Return a key's description without shape and unit, which have their own columns."""
     words = " ".join(field.get("description", "").split())
     if key == "shape":
         words = "Which shape it is."
@@ -168,5 +168,5 @@ def _meaning(key: str, field: Schema, unit: str) -> str:
 
 
 def toml(text: str) -> str:
-    """An example."""
+    """Return an example as a code block."""
     return f"```toml\n{text.strip()}\n```\n"

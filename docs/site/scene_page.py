@@ -1,7 +1,7 @@
-"""The page that lists the tables of a scene file: ``python docs/site/scene_page.py`` writes docs/scene_file.md.
+"""``python docs/site/scene_page.py`` writes docs/scene_file.md, the page of all tables of a scene file.
 
-Its tables come from the models in `cortado.scene`, so that they say what is checked. Each table has an example, which
-together with `WHOLE` is a valid scene; `tests/test_docs.py` loads them.
+The models in `cortado.scene` check scenes, and the page describes the keys of these models. The example of each table
+is a valid scene together with `WHOLE`. `tests/test_docs.py` loads all examples.
 """
 
 from pathlib import Path
@@ -59,7 +59,7 @@ LINKS = {
     "render": ("[table](#pictures-render)", "How pictures are taken."),
     "picture": ("[table](#shaded-pictures-picture)", "How shaded pictures and films are made."),
 }
-"""Of keys that are tables what they are, with the heading that describes them, and their meaning."""
+"""Type, with a link to the description, and meaning of each key that is a table."""
 
 
 DEFAULTS = {
@@ -67,14 +67,14 @@ DEFAULTS = {
     "kernel": '`"wendland_c2"` with the projection if `support` is left out too, else `"cubic_spline"`',
     "jitter": "`0.05` with the projection if all axes are periodic, else `0.0`",
 }
-"""Of keys of `[discretisation]`, which the solver decides; `tests/test_facts.py` holds them against scenes."""
+"""Defaults of keys of `[discretisation]` that depend on the solver. `tests/test_facts.py` compares them with scenes."""
 OF_EMITTERS = {"jitter": "`0.05` with the projection, else `0.0`"}
-"""The same of keys of `[[emitter]]`."""
+"""Defaults of keys of `[[emitter]]` that depend on the solver."""
 DECIDED = {"DiscretisationTable": DEFAULTS, "EmitterTable": OF_EMITTERS}
 
 
 def _with_law(rheology: str) -> str:
-    """A phase with a law of viscosity."""
+    """Return a phase with a law of viscosity."""
     return f'[[phase]]\nname = "water"\nrest_density = 1000.0\nviscosity = 0.05\nrheology = {rheology}'
 
 
@@ -480,11 +480,11 @@ PARTS: list[tuple[str, str, tuple[tuple[str, str, str], ...]]] = [
         ),
     ),
 ]
-"""Of every section its heading, its words, and tables: name of the model, heading, example."""
+"""Sections of the page: heading, text, and tables. Each table has the name of its model, a heading, and an example."""
 
 
 def examples() -> dict[str, str]:
-    """By the name of the model."""
+    """Return the examples by the name of the model."""
     return {model: example for _, _, tables in PARTS for model, _, example in tables}
 
 
@@ -493,7 +493,7 @@ NEXT = "*Next*: [a scene of your own](own_scene.md), [the cookbook](cookbook.md)
 
 
 def page() -> str:
-    """The whole page, in which keys that several tables of a section have stand once, before these tables."""
+    """Return the page. Keys that tables of a section share appear once, before these tables."""
     schema: dict[str, Any] = Scene.model_json_schema()
     parts = [BEGINNING.format(whole=toml(WHOLE), top=rows(schema, LINKS)).rstrip("\n")]
     for heading, words, tables in PARTS:

@@ -1,4 +1,4 @@
-"""Names in docstrings, such as `Problem`, lead to where they are described, without the module in front of them."""
+"""Link names without a module in docstrings, such as `Problem`, to their description in the site."""
 
 from typing import Any
 

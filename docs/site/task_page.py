@@ -1,7 +1,7 @@
-"""The page that lists the tables of a task: ``python docs/site/task_page.py`` writes docs/task_file.md.
+"""``python docs/site/task_page.py`` writes docs/task_file.md, the page of all tables of a task file.
 
-Its tables come from the models in `cortado.optimisation.task_tables`, so that they say what is checked. Each
-table has an example, which below the scene of `scene_page` is a valid task; `tests/test_docs.py` loads them.
+The models in `cortado.optimisation.task_tables` check tasks, and the page describes the keys of these models. The
+example of each table, appended to the scene of `scene_page`, is a valid task. `tests/test_docs.py` loads all examples.
 """
 
 from pathlib import Path
@@ -98,7 +98,7 @@ PARTS = [
         "[optimise.check]\nloss_reduction = 100.0\nparameter_error = 0.01",
     ),
 ]
-"""Of every section its heading, the name of its model, its words, and an example."""
+"""Sections of the page: heading, name of the model, text, and example."""
 
 FIT_PARTS = [
     (
@@ -131,7 +131,7 @@ FIT_PARTS = [
         "[fit]\nstart.viscosity = 0.5               # Pa s\nbounds.viscosity = [0.01, 10.0]\nprofiles = 0",
     ),
 ]
-"""The same of tasks with measured data."""
+"""Sections about tasks with measured data."""
 MEASURED = """
 ## What was measured: `[[problem.measured]]`
 
@@ -142,12 +142,12 @@ scene that has the sensor, these tables make a task for `cortado fit`:
 
 
 def examples() -> dict[str, str]:
-    """By the name of the model."""
+    """Return the examples by the name of the model."""
     return {model: example for _, model, _, example in [*PARTS, *FIT_PARTS]}
 
 
 def page() -> str:
-    """The whole page, in which keys that several things measured have stand once, before them."""
+    """Return the page. Keys that tables of measured data share appear once, before these tables."""
     tables = {**TaskTables.model_json_schema()["$defs"], **FitTables.model_json_schema()["$defs"]}
     sections = [
         f"\n{heading}\n\n{words}\n\n{rows(tables[model], LINKS)}\n{toml(example)}"
