@@ -4,8 +4,8 @@
     python docs/site/gallery.py --only honey --only jug
 
 ``--coarser 3 --part 0.1`` draws the first tenth of each film with spacings three times as wide, for a try on a CPU.
-Each of several films has its own process, with ``--at-a-time`` processes in parallel. A failed film does not stop the
-other films. The script deletes the runs.
+Several films run in separate processes, ``--at-a-time`` in parallel. Failed films do not stop other films. The script
+deletes all runs.
 """
 
 import argparse

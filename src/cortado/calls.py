@@ -207,7 +207,7 @@ def keep_own(made: object, name: str) -> None:
 
 
 class Staying:
-    """A base class for objects with arrays on a device. Pickling or copying such an object raises `InputError`."""
+    """A base class for objects with arrays on a device. Pickling or copying a derived object raises `InputError`."""
 
     instead: ClassVar[str] = "but NumPy arrays of its contents can"
     """End of the error message, which names the objects that can be pickled instead."""
@@ -238,7 +238,7 @@ def sized(arrays: Mapping[str, Any]) -> str:
 
 
 class ShortRepr:
-    """A base class whose ``repr`` shows shapes of arrays. Its dataclasses must be declared with ``repr=False``."""
+    """A base class whose ``repr`` shows shapes of arrays. Derived dataclasses must have ``repr=False``."""
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]

@@ -34,18 +34,17 @@ def warn(sentence: str, category: type[Warning] = CortadoWarning) -> None:
 
 @contextmanager
 def unwarned(category: type[Warning] = CortadoWarning) -> Iterator[None]:
-    """Suppress Cortado's warnings of a category."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", category)
         yield
 
 
 class InputError(CortadoError):
-    """An error in the user's input. The exit code is 2."""
+    """An error in the user's input, with the exit code 2."""
 
 
 class OutOfRangeError(InputError):
-    """An error for a parameter value that makes a run impossible. `evaluate` continues with other points."""
+    """An error for parameters that make a run impossible. After this error, `evaluate` continues with other points."""
 
 
 class Words(str):
@@ -57,7 +56,7 @@ class MissingDerivativeError(InputError):
 
 
 class SceneError(CortadoError):
-    """An error in a scene. The message names the key, the wrong value and the allowed values. The exit code is 2."""
+    """An error in a scene, with the exit code 2. The message names the key, the wrong value and the allowed values."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
         """Store the message's parts. ``sentence`` replaces "is <found>, but must be <wanted>"."""
@@ -65,7 +64,7 @@ class SceneError(CortadoError):
         self.file = file
         """Path of the scene file as the user gave it, or None for a scene built in Python."""
         self.field = field
-        """Key of the scene, such as ``fluid[0].upper``. The key is empty for an error of the whole scene."""
+        """Key of the scene, such as ``fluid[0].upper``, or an empty text for an error of the whole scene."""
         self.found = found
         """Wrong value of the key, or a `Words` text that describes the mistake."""
         self.wanted = wanted
@@ -82,7 +81,7 @@ class SceneError(CortadoError):
 
 
 class ComputationError(CortadoError):
-    """An error for a computation that failed although the input was valid. The exit code is 1."""
+    """An error for a failed computation from valid input, with the exit code 1."""
 
 
 class DivergedError(ComputationError):
@@ -102,7 +101,7 @@ class DivergedError(ComputationError):
         self.others = others
         """Number of other particles that the same step lost."""
         self.preface = preface
-        """First sentence of the message, about all runs of an ensemble. The sentence is empty for a single run."""
+        """First sentence of the message, about all runs of an ensemble. For a single run, this text is empty."""
 
     def with_advice(self, advice: str) -> "DivergedError":
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
@@ -134,7 +133,7 @@ def shown(value: Any) -> str:
 
 
 class EngineMissingError(CortadoError, ImportError):
-    """An error if the reference engine is not installed."""
+    """An error for a missing reference engine."""
 
     def __str__(self) -> str:
         said = "The reference engine is not installed: in a clone of the repository pip install ./reference"
@@ -142,7 +141,7 @@ class EngineMissingError(CortadoError, ImportError):
 
 
 class ExtraMissingError(InputError, ImportError):
-    """An error if a library of an optional dependency group is not installed. The exit code is 2."""
+    """An error for a missing library of an optional dependency group, with the exit code 2."""
 
     def __init__(self, name: str, package: str):
         super().__init__(name, package)
@@ -153,7 +152,7 @@ class ExtraMissingError(InputError, ImportError):
 
 
 class LibraryMissingError(CortadoError, ImportError):
-    """An error if an optional library is not installed."""
+    """An error for a missing optional library."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
         """Store the library's ``name``, the ``package`` that contains it, and Cortado's ``module`` that needs it."""

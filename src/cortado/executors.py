@@ -230,7 +230,6 @@ class _Map:
         return bool(self._sent)
 
     def _count_workers(self, interval: float) -> None:
-        """Count workers, at most once per ``interval`` [s]."""
         now = time.monotonic()
         if now - self._counted < interval:
             return

@@ -72,7 +72,7 @@ class Pyramid:
     """Number of levels, by default the number of weights. Without weights, the coarsest level has at most 2 x 2
     pixels."""
     weights: tuple[float, ...] | None = None
-    """Weights of the levels (levels,) from fine to coarse. They should increase, as blurring makes shapes fainter."""
+    """Weights of the levels (levels,) from fine to coarse. Weights should increase, as blur makes shapes fainter."""
 
     def __post_init__(self) -> None:
         if self.levels is not None:

@@ -137,7 +137,7 @@ class Problem:
 
         ``loss`` is an object with ``value`` and ``adjoint``, a `losses.Frames` of such objects, or a function of Warp
         arrays (see `losses.Recorded`). ``memory_budget`` is the memory [bytes] for states stored by the forward run.
-        The backward pass computes the remaining states again.
+        The backward pass computes all other states again.
 
         ``state`` is the first state, or a list with one first state for each scene of a batch; see `Simulation.state`.
         With a given ``state``, parameters apply to the steps after this state, and parameters for initial values raise

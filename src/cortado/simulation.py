@@ -125,7 +125,7 @@ class Simulation(Stepping):
         self.lattice, self.masses = discrete.lattice, discrete.masses
         """Constants of the rest lattice, and the actual and the prescribed masses [kg] of the fluid."""
         self.free_particles = discrete.fluid.emitted.start
-        """Number of particles that do not start in an emitter. In arrays, particles of emitters come last."""
+        """Number of particles that do not start in an emitter. Arrays end with the particles of emitters."""
         own = (self.scene, discrete, self.free_energy, self.precision, self.device, self.batch, self.forces, self.known)
         self.solver: Solver = build.built(self._maker, build.SolverSetting(*own, self._called, self._lanes))
         self.initial = self.solver.new_state()
@@ -138,8 +138,7 @@ class Simulation(Stepping):
 
     @property
     def carried_by(self) -> str | None:
-        """Name of the solver if its states have additional fields, else None. Only this solver can continue from such
-        states."""
+        """Name of the solver if its states have additional fields, which no other solver can read, else None."""
         return self._called if getattr(self.solver, "carried_fields", ()) else None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -196,8 +195,7 @@ class Simulation(Stepping):
             time: duration [s] in place of ``steps``. The run ends with the first step that ends at this time or
                 later.
 
-        Warns if the pressure did not converge. A lost particle causes a warning in a batch, and a `DivergedError` in a
-        single run.
+        `run` warns if the pressure did not converge. A lost particle causes a `DivergedError`, or in a batch a warning.
         """
         own, number = self.__dict__, steps_of_run(self, steps, time, {} if controls is None else controls)
         rollout = own.pop("_idle", None)  # not to be had by a run within this one
@@ -325,7 +323,7 @@ class Simulation(Stepping):
         The scene's table ``[render]`` sets the view. The default camera looks down in 3-D, and at the plane in 2-D.
 
         ``settings`` replace keys of ``[render]``, such as ``resolution=(320, 240)`` or ``view="volume", position=(1, 1,
-        2), look_at=(0.2, 0.2, 0.2)``. `losses.Image` takes the renderer. Raises `SceneError` for invalid settings.
+        2), look_at=(0.2, 0.2, 0.2)``. `losses.Image` needs a renderer. Raises `SceneError` for invalid settings.
         """
         return scene_renderer(self, **settings)
 
@@ -368,8 +366,8 @@ class Simulation(Stepping):
         return Simulation(self.scene.replaced(*overrides), *others)
 
     def room(self, steps: int, checkpoints: float) -> int:
-        """Return the number of runs of ``steps`` steps to compute together. Their data fit into half of the free
-        memory. ``checkpoints`` is the greatest total size of stored states [byte]."""
+        """Return the number of runs of ``steps`` steps to compute together, within half of the free memory.
+        ``checkpoints`` is the greatest total size of stored states [byte]."""
         steps, most = whole_number("steps", steps, 0), as_one_number("checkpoints", checkpoints)
         neighbours, real = build.first_capacity(self.scene.discretisation.support, self.dimension), self.precision.bytes
         own = sum(simulation_parts(self.particles, 0, neighbours, real).values())
@@ -385,10 +383,10 @@ class Simulation(Stepping):
     def substeps(
         self, time_step: np.ndarray, mobility: np.ndarray, interface_width: np.ndarray, rest_density: np.ndarray
     ) -> int:
-        """Return the smallest stable number of explicit diffusion substeps in each ``time_step`` [s].
+        """Return the smallest stable number of explicit diffusion substeps per ``time_step`` [s].
 
         ``mobility`` is in m2/s, ``interface_width`` in m, and ``rest_density`` (phases,) in kg/m3. Raises `InputError`
-        if the number exceeds `cortado.sph.free_energy.MOST_SUBSTEPS`.
+        for more substeps than `cortado.sph.free_energy.MOST_SUBSTEPS`.
         """
         if len(self.scene.phase) == 1:
             return 0

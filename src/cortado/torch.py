@@ -41,7 +41,7 @@ class Steps(torch.nn.Module):
         trained: Values | None = None,
         gradient: AdjointEstimator | None = None,
     ):
-        """Make the module. ``trained`` are first values, as in ``{"viscosity": 0.1}``. ``gradient`` is as in `step`."""
+        """``trained`` are initial values of parameters, as in ``{"viscosity": 0.1}``. ``gradient`` is as in `step`."""
         super().__init__()
         layer = user_functions.steps_layer(simulation, steps, gradient)
         self.simulation, self.steps, self.gradient = simulation, steps, gradient
@@ -50,7 +50,8 @@ class Steps(torch.nn.Module):
         self.trained, self._names = torch.nn.ParameterDict(trained_by_key), tuple(made)
 
     def forward(self, given: Tensors, parameters: Tensors | None = None) -> dict[str, "torch.Tensor"]:
-        """Return the state after the steps. ``parameters`` are additional parameters, which are not trained."""
+        """Return the state after the steps. ``parameters`` are additional parameters, which the module does not
+        train."""
         own = {name: self.trained[name.replace(".", "/")] for name in self._names}
         for name in parameters or {}:
             if name in own:

@@ -21,8 +21,6 @@ from cortado.scene.parameters import QUANTITIES, check_quantity
 
 
 class Watch:
-    """Records quantities and reads sensors of a rollout."""
-
     def __init__(
         self, simulation: Any, rollout: Rollout, record: Iterable[str] = (), sensors: Mapping[str, Sensor] | None = None
     ):

@@ -284,7 +284,6 @@ def export(
 
 
 def labelled(trajectory: Trajectory) -> Any:
-    """Implement `Trajectory.to_xarray`."""
     try:
         import xarray
     except ImportError as error:

@@ -107,16 +107,15 @@ class Pose:
 class ExportedSolid:
     name: str
     part: str
-    """Unique name in files: "solid_" and letters, digits and underscores."""
+    """Unique name in files, which begins with "solid_" and has only letters, digits and underscores."""
     mesh: Mesh
-    """Mesh relative to the solid's middle, without rotation."""
+    """Mesh of the solid with its middle at the origin, without rotation."""
     moves: bool
 
 
 @dataclass(frozen=True)
 class ExportedFrame:
     time: float
-    """Time [s]."""
     positions: Points
     """Positions of the particles (n, 3) [m]."""
     velocities: Points

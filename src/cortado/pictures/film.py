@@ -88,8 +88,8 @@ class FilmedRun:
 
 
 def framed_together(stages: Sequence[PlaneStage | Stage], spare: int = 0) -> tuple[list[PlaneStage | Stage], int]:
-    """Return stages with a common scale that fit into one page, and the number of pictures per row. ``spare`` columns
-    of the page stay free. Raises `InputError` if the pictures would be too small."""
+    """Return stages with a common scale that fit into one page, and the number of pictures per row. The last ``spare``
+    columns of pixels stay free. Raises `InputError` if the pictures would be too small."""
     whole, count = stages[0].picture, len(stages)
     page = whole.model_copy(update={"width": max(whole.width - spare, 1)})
     lower, upper = (np.array(ends) for ends in zip(*(stage.ends for stage in stages), strict=True))
@@ -124,7 +124,7 @@ def lacking(scene: Scene) -> str | None:
 
 
 def film(path: Path, page: Page, frames: Sequence[int], pace: Pace) -> Film:
-    """Write a film. After an interruption, a second call continues the film."""
+    """Write a film, or continue an interrupted film."""
     shown = [frames[k] for k in pace.frames]
     note = page.fingerprint and f"{page.fingerprint} {len(shown)} {pace.speed}"
     with moving_picture(path, pace.frames_per_second, note, len(shown)) as video:
@@ -230,7 +230,7 @@ def shown_places(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 
 def those(out: NDArray[np.bool_]) -> NDArray[np.bool_] | slice:
-    """Convert a mask (n,) to an index. A mask of True alone becomes a slice, which copies nothing."""
+    """Convert a mask (n,) to an index. If all entries are True, the index is a slice, which copies nothing."""
     return slice(None) if out.all() else out
 
 
@@ -247,7 +247,7 @@ def ages(scene: Scene, trajectory: Trajectory) -> NDArray:
 
 def coloured_by(scene: Scene, trajectory: Trajectory, simulation: Computed = None) -> NDArray | None:
     """Return values (frames, n) for a colour scale, or None for the colours of phases. Raises `InputError` for a
-    quantity     that was not recorded and cannot be computed."""
+    quantity that was not recorded and cannot be computed."""
     name = (scene.picture or Picture()).colour
     if name == "phase":
         return None

@@ -74,8 +74,8 @@ def particle_view(
     clouds: Sequence[Cloud], times: ArrayLike, spacing: float, *, lines: ArrayLike = (), stride: int = 1
 ) -> str:
     """Return HTML that shows clouds of the same size side by side, with the y axis up. ``times`` (frames,) are in
-    seconds. ``lines`` (k, 2, d) [m] are end points of lines. The clouds contain every ``stride``-th particle. At rest,
-    particles have the distance ``spacing`` [m]."""
+    seconds. ``lines`` (k, 2, d) [m] are end points of lines. The clouds contain every ``stride``-th particle. Particles
+    at rest have the distance ``spacing`` [m] from each other."""
     times, (_, particles, dimension) = np.asarray(times, dtype=float), clouds[0].positions.shape
     ends = np.asarray(lines, dtype=float).reshape(-1, 2, dimension)
     shown = np.concatenate([array.reshape(-1, dimension) for array in (*(cloud.positions for cloud in clouds), ends)])
@@ -192,7 +192,7 @@ MOST_NUMBERS = 6
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report. Empty parts are left out."""
+    """A section of a report. The report omits empty parts of the section."""
 
     title: str
     words: Sequence[object] = ()
@@ -212,8 +212,8 @@ def write_report(folder: RunFolder, title: str, sections: Sequence[Section]) -> 
         noted = json.loads(folder.environment.read_text(encoding="utf-8"))
         commands = [noted["command"], *(session["command"] for session in noted["resumed"])]
         lines, place = escape("\n".join(map(shlex.join, commands))), escape(str(folder.path))
-        again = f"<pre>{lines}</pre>\n<p>With --overwrite it takes the place of this run. The folder of the run is "
-        again += f"{place}; scene.json in it is the scene with everything that was replaced.</p>"
+        again = f"<pre>{lines}</pre>\n<p>With --overwrite, a new run replaces this run. The folder of the run is "
+        again += f"{place}. Its file scene.json contains the scene with all replaced values.</p>"
     parts = "\n".join(_section(section) for section in sections)
     player = script() if any(section.view for section in sections) else ""
     look = f"{Path(__file__).with_name('report.css').read_text(encoding='utf-8')}\n{style()}"
@@ -253,7 +253,6 @@ def add_to_report(folder: RunFolder, caption: str, path: Path) -> None:
 
 
 def written(value: Any) -> str:
-    """Format numbers as text. More than 12 numbers become their count and range."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         return str(value)

@@ -28,7 +28,7 @@ SUPPORT = 1.3
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:
     """Return shaded colours (rows, columns, 3). ``cover`` (rows, columns) is the covered fraction of each pixel. The
-    edge of     the shape is ``width`` pixels wide."""
+    edge of the shape is ``width`` pixels wide."""
     from scipy.ndimage import gaussian_filter
 
     height = gaussian_filter(cover, width)
@@ -53,7 +53,7 @@ class PlaneStage:
     picture: Picture
     container: BoxContainer | None
     lower: Points
-    """Lower corner (2,) [m] of the container, or without a container of the fluid and the solids."""
+    """Lower corner (2,) [m] of the container if the scene has one, else of the fluid and the solids."""
     upper: Points
     spacing: float
     solids: tuple[ShownSolid, ...] = ()

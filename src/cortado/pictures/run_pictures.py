@@ -45,7 +45,8 @@ Given = Scene | str | Path | None
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Draw a run. Return captions and paths. Film and contact sheet have the scene's quality, by default "quick"."""
+    """Draw a run. Return captions and paths. Film and contact sheet have the quality of the scene, by default
+    "quick"."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []
@@ -147,7 +148,6 @@ def trajectory_film(trajectory: Trajectory, path: str | Path, scene: Given, devi
 
 
 def device_of(name: str) -> Any:
-    """Return the Warp device with this name, or raise `InputError`."""
     start_warp()
     return device_named(name)
 
@@ -167,7 +167,7 @@ def _units_of_fields(simulation: Simulation) -> dict[str, str]:
 
 def shown_as(scene: Scene, settings: Settings, fields: Collection[str] = ()) -> Scene:
     """Return the scene with ``settings`` in its table [picture]. ``colour`` may name one of the recorded ``fields``.
-    Raises     `SceneError` for invalid settings."""
+    Raises `SceneError` for invalid settings."""
     given = {} if scene.picture is None else scene.picture.model_dump()
     wanted = {**given, **settings}
     if "lines" in settings:

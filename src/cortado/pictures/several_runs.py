@@ -43,7 +43,7 @@ def film_side_by_side(
     """Write a film of up to nine runs side by side, an mp4 or webp as in `Trajectory.film`, and return it.
 
     All runs share the clock, the camera, the colour scale and the table [picture] of the first scene. At each time of
-    the film, each run shows its recorded frame with the nearest time. A run that has ended shows its last frame.
+    the film, each run shows its recorded frame with the nearest time. An ended run shows its last frame.
 
     Args:
         runs: trajectories by label, or a list of trajectories. The labels of a list are made of the values that differ
@@ -83,7 +83,7 @@ def film_side_by_side(
 
 
 def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
-    """Return scenes with the same table [picture]. Raises `InputError` for runs that do not fit together."""
+    """Return scenes with the same table [picture]. Raises `InputError` for runs that one film cannot show."""
     if not 0 < len(scenes) <= MOST_PICTURES:
         raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
     if len({scene.dimension for scene in scenes}) > 1:
@@ -99,7 +99,7 @@ def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: M
 
 
 def runs_page(runs: Sequence[ShownRun], names: Sequence[str], device: Any) -> tuple[Page, NDArray[Any]]:
-    """Return a page of runs, and the times of its frames [s]. Prepare the scenes with `shown_alike`."""
+    """Return a page of runs, and the times of its frames [s]. `shown_alike` prepares the scenes of the runs."""
     times = common_times([run.trajectory.due for run in runs])
     values = [run.values.ravel() for run in runs if run.values is not None]
     picture = runs[0].scene.picture or Picture()
@@ -180,7 +180,7 @@ class ShownFrames:
 
 
 def labels(scenes: Sequence[Scene], otherwise: Sequence[str]) -> list[str]:
-    """Return distinct names: of the scenes, by differing values as in ``viscosity = 0.1 Pa s``, or ``otherwise``."""
+    """Return scene names if they differ, else differing values such as ``viscosity = 0.1 Pa s``, else ``otherwise``."""
     tables = [computed(json.loads(scene.to_json())) for scene in scenes]
     keys = list(dict.fromkeys(key for table in tables[1:] for key in differences(tables[0], table, "missing")))
     short = [key.rpartition(".")[2] for key in keys]

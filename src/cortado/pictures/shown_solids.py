@@ -68,7 +68,6 @@ class ShownSolid:
 
     @property
     def colour(self) -> Points:
-        """Linear colour (3,)."""
         return np.array(self.finish.colour)
 
     @property

@@ -47,7 +47,7 @@ def fluid_extent(states: Sequence[Points], around: Sequence[tuple[Points, Points
 
 
 def _ends(positions: Points, share: float) -> tuple[Points, Points]:
-    """Return the corners (d,) [m] of a box. Along each axis, a ``share`` of the positions is beyond each side."""
+    """Return the quantiles ``share`` and 1 - ``share`` of positions along each axis (d,) [m]."""
     lower, upper = np.quantile(positions, (share, 1.0 - share), axis=0)
     return lower, upper
 
@@ -162,7 +162,7 @@ class Stage:
 
     @property
     def home_around(self) -> View:
-        """First view of a circling camera. By default the whole region is visible from every side."""
+        """First view of a circling camera. By default the camera sees the whole region from every side."""
         if self.picture.camera is not None:
             return self.home
         back, middle = self.eye - self.look_at, 0.5 * (self.seen[0] + self.seen[1])

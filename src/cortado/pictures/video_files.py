@@ -22,7 +22,7 @@ from cortado.files.terminal import held
 VIDEO_QUALITY = "18"
 BITS = 1.2e6
 THREADS = 8
-"""Number of encoder threads. The bytes of a file depend on this number."""
+"""Number of encoder threads, on which the bytes of a video file depend."""
 HELPERS = 4
 TICKS = 90_000
 
@@ -60,7 +60,7 @@ class Video:
             self.frames += 1
 
     def copy(self, other: Any) -> None:
-        """Copy the frames of an open video. Call this before adding frames."""
+        """Copy the frames of an open video. `copy` must precede `add`."""
         from av.bitstream import BitStreamFilterContext
 
         source = other.streams.video[0]

@@ -28,7 +28,7 @@ from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_o
 NEIGHBOURS = 24
 """Number of particles that are averaged for the colour of a surface point."""
 ROUND = 10_000
-"""Greatest number of spheres drawn with 128 triangles each. More spheres are drawn with 32 triangles each."""
+"""Greatest number of spheres with 128 triangles each. In larger numbers, spheres have 32 triangles each."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ REACH_OF_COLOURS = 2.25
 """Support radius of the kernel for the fluid's colour [spacings]."""
 ROUNDS, ROUNDS_OF_LIGHT = 36, 9
 CUBE_WIDTHS = (30_000, 0.375), (60_000, 0.45), (inf, 0.55)
-"""Greatest number of particles, and width of the lattice cubes [spacings] up to this number."""
+"""Greatest number of particles, and width [spacings] of the lattice cubes for at most so many particles."""
 WeightedLook = wp.types.vector(6, wp.float32)
 MOST_CELLS = 1 << 26
 """Greatest number of cells in the grid that finds near particles."""
@@ -194,7 +194,7 @@ def liquid_level(particles: Particles, spacing: float, launch: BandLauncher, lea
 def liquid_surface(
     particles: Particles, spacing: float, launch: BandLauncher, least: float = 0.0, level: Level | None = None
 ) -> LiquidSurface:
-    """Return a smooth surface with thin sheets (Löschner et al. 2023). Raises `ComputationError` without a surface."""
+    """Return a smooth surface with thin sheets (Löschner et al. 2023), or raise `ComputationError` if there is none."""
     device, reach = launch.device, REACH * spacing
     if level is None:
         level, s = liquid_level(particles, spacing, launch, least)

@@ -53,7 +53,7 @@ class Particles:
     @classmethod
     def on(cls, device: Any, places: Points, colours: Points, media: ArrayLike = OPAQUE) -> "Particles":
         """``media`` (n, 2) or (2,) are scattering and absorption [1/m]. Raises `ComputationError` for positions that
-        are not         finite."""
+        are not finite."""
         finite = np.isfinite(places)
         if not finite.all():
             astray = len(places) - int(finite.all(axis=1).sum())

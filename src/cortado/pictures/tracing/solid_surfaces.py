@@ -164,7 +164,7 @@ class FloorShadow:
         self._add(parts, [self._array(one) for one in volumes], 0.0, 1.0 - shown.finish.transparency, 0.0)
 
     def _add(self, parts: Particles, volumes: list[wp.array], least: float, opacity: float, tinted: float) -> None:
-        """``volumes`` (n,) [m3] are for lamp and sky. ``least`` [m] is the smallest width of the blur."""
+        """``volumes`` (n,) [m3] are for the lamp and for the sky. ``least`` [m] is the smallest width of the blur."""
         if not len(parts):
             return
         stage = self._stage
@@ -228,7 +228,7 @@ class SolidSurfaces:
                 shadow.of_solid(one, mesh)
 
     def on_device(self, solids: Sequence[ShownSolid]) -> tuple[Any, list[DeviceSurface]]:
-        """Return a struct `Solids` and its surfaces. Keep the surfaces alive while the struct is used."""
+        """Return a struct `Solids` and its surfaces. The caller must keep the surfaces alive."""
         found, surfaces, lit = Solids(), list[DeviceSurface](), [LitSurface(), LitSurface()]
         found.are_cut, placed = int(self._stage.cuts_solids), self._placed(solids)
         for k, is_clear in enumerate((False, True)):

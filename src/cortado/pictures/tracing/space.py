@@ -51,8 +51,8 @@ SAME_SIDE = 0.8
 
 def mirrored(points: Points, solids: Sequence[ShownSolid], near: float, spacing: float) -> tuple[Points, np.ndarray]:
     """Return mirror images (m, d) [m] of points (n, d) [m] behind solids, and the index of each original point (m,).
-    Sides of solids within ``near`` [m] of a point, and corners between such sides, mirror the point. In thin solids an
-    image is nearer to the surface, or missing."""
+    Sides of solids within ``near`` [m] of a point, and corners between such sides, mirror the point. A thin solid has
+    images closer to its surface, or none."""
     dimension = points.shape[1]
     images, of = [np.zeros((0, dimension))], [np.zeros(0, dtype=int)]
     for shown in solids:
@@ -289,7 +289,7 @@ class SpacePainter:
             return self._rays(*self.scenery(state, steadied(own, before, after, self.stage.spacing, self._launch)))
 
     def scenery(self, state: State, steady: Any = None) -> tuple[Stage, Any, DeviceSurface, FloorShadow]:
-        """Return the parts of a picture. An averaged frame ``steady`` replaces the state's surface and shadow."""
+        """Return stage, environment, surface and shadow. A frame ``steady`` replaces the state's surface and shadow."""
         stage, s, particles, shadow = self._placed(state)
         if steady is None:
             shadow.of_fluid(particles)

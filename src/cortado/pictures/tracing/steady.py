@@ -26,10 +26,10 @@ from cortado.pictures.tracing.surface_net import CUBES, WIDTH, Blocks, block_at,
 WINDOW, SHADOW_WINDOW = 30, 6
 """Greatest numbers of frames on each side of the averaged frame: for the surface, and for the shadow."""
 LIMITS, LEVEL_LIMITS, SHADOW_LIMITS = (0.35, 0.7), (0.4, 0.8), (0.02, 0.04)
-"""Two limits each for the displacement [spacings], the change of density, and the change of light between frames. Below
-the first limit a frame has full weight. Above the second limit its weight is 0."""
+"""Two limits each for the displacement [spacings], the change of density, and the change of light between frames. A
+frame has full weight below the first limit and the weight 0 above the second limit."""
 BODY_REACH, BODY = 6.0, wp.constant(wp.vec2(7.0, 12.0))
-"""Distance [spacings] within which particles around a block count, and the counts for a drop and for bulk fluid."""
+"""Distance [spacings] for counting particles around a block. Numbers of particles that mark a drop and bulk fluid."""
 TOUCHING = wp.constant(27)
 
 

@@ -1,7 +1,7 @@
 """The isosurface of a fluid density as a surface net of quadrilaterals (Gibson 1998). The net has one corner in each
 lattice cube that the surface crosses, and a quadrilateral for each crossed edge of a cube. Blocks of `WIDTH` cubes
-along each axis divide the lattice. Names with ``level`` stand for the density, which is computed only in blocks that
-may contain the surface."""
+along each axis divide the lattice. The density, called ``level`` in names, is computed only in blocks that may contain
+the surface."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -108,7 +108,7 @@ def volume(s: NearParticles, j: wp.int32):
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def mark_corners(first: wp.int32, s: NearParticles, reach: wp.float32, b: Blocks):
-    """Set ``b.corners`` to 1 within ``reach`` of a particle."""
+    """Set ``b.corners`` to 1 at corners within ``reach`` [m] of a particle along each axis."""
     p = s.places[first + wp.tid()] - b.lower
     wide = b.cube * float(WIDTH)
     low = (p - wp.vec3(reach)) / wide

@@ -36,7 +36,7 @@ class Effort(NamedTuple):
     """Smallest width of a lattice cube for the fluid's surface [spacings]."""
     segments: int
     contrast: float
-    """Contrast in linear light between adjacent pixels. Above this contrast, a pixel gets additional rays."""
+    """Contrast in linear light between adjacent pixels, above which a pixel gets additional rays."""
     again: int
     """Number of additional rays of a pixel."""
     lights: tuple[int, int]
@@ -59,7 +59,7 @@ BOUNCED = wp.constant(wp.float32(0.45))
 @wp.func
 def past_solids(s: Environment, p: wp.vec3, d: wp.vec3, reach: wp.float32, light: wp.vec3):
     """A solid within ``reach`` [m] blocks light and adds light of its colour. A near solid blocks more than a distant
-    solid.     For a point inside a solid, no light is blocked."""
+    solid. For a point inside a solid, no light is blocked."""
     hit = wp.mesh_query_ray(s.solids.opaque, p, d, reach)
     if not hit.result or hit.sign < 0.0:
         return light
