@@ -217,7 +217,8 @@ class Simulation(Stepping):
         sensors: Mapping[str, Sensor] | None = None,
         observe: Callable[[int], object] | None = None,
     ) -> Trajectory:
-        """Run a ``rollout`` forward and return its frames. All other arguments, warnings and errors are as in `run`."""
+        """Run a ``rollout`` forward and return its frames. The arguments ``record_every``, ``record``, ``sensors`` and
+        ``observe`` are as in `run`, with the same warnings and errors."""
         record_every = whole_number("record_every", record_every, 1)
         numbers = 2 * (self.batch or 1) * self.numbers_in_frame(self.dimension)
         expected = expected_frames(rollout, record_every)
