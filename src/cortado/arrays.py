@@ -15,7 +15,7 @@ GREATEST_NUMBER = 10**18
 
 
 def as_number(value: Any) -> float | None:
-    """Return a finite number as a float, and None for any other value or a bool."""
+    """Return a finite number as a float, and None for any other value, such as a bool."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         return None
     try:

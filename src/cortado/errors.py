@@ -71,7 +71,7 @@ class SceneError(CortadoError):
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
-        """Return a copy of this error with the name of the file."""
+        """Return a copy of this error with the name of the scene file."""
         _, *rest = self.args
         return SceneError(file, *rest)
 
@@ -155,7 +155,7 @@ class LibraryMissingError(CortadoError, ImportError):
     """An error for a missing optional library."""
 
     def __init__(self, name: str, package: str, module: str | None = None):
-        """Store the library's ``name``, the ``package`` that contains it, and Cortado's ``module`` that needs it."""
+        """``package`` contains the library ``name``, which Cortado's ``module`` needs."""
         super().__init__(name, package, module)
         self.package = package
 

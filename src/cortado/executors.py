@@ -102,8 +102,8 @@ AHEAD = 2
 class Distributed(Executor):
     """An executor on the workers of a scheduler of Dask's distributed.
 
-    If a worker is lost, its items are computed again by the remaining workers. Results and errors are bitwise the same
-    as in one process. A worker computes one item at a time, and caches the last few functions.
+    If a worker is lost, the remaining workers compute the lost items again. Results and errors are bitwise the same as
+    in one process. A worker computes one item at a time, and caches the last few functions.
 
     Example: ``workers = cortado.executors.Distributed("tcp://10.0.0.1:8786")``
     """
@@ -124,7 +124,7 @@ class Distributed(Executor):
         return f"Distributed({self.address!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        raise InputError("An executor cannot be used within a computation of another executor: leave out one of them.")
+        raise InputError("An executor cannot be used within a computation of another executor: use one executor.")
 
     def __enter__(self) -> Self:
         return self

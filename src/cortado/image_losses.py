@@ -61,7 +61,7 @@ class Pyramid:
     Adelson 1983).
 
     The first level is the image. Each further level is the previous level, blurred and halved in size. Coarse levels
-    locate a shape before it overlaps its target, and fine levels compare outlines.
+    locate a shape that does not overlap its target. Fine levels compare outlines.
 
     ``levels`` is the number of levels. ``weights`` (levels,) go from fine to coarse, by default 1, 2, 4 ...
 

@@ -1,6 +1,6 @@
 """Cortado as a layer of JAX. `docs/layers.md` has examples.
 
-States are dictionaries of arrays by field name, with the ``time`` [s]. Parameters have the names of `Problem`.
+States are dictionaries of arrays by field name, with the ``time`` [s]. Parameters have names as in `Problem`.
 
 All functions are differentiable in forward and reverse mode, run as batches under `jax.vmap`, and work inside `jax.jit`
 and `jax.lax.scan`. Second derivatives raise an error. In compiled programs, Cortado's error message is a part of JAX's

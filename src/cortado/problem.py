@@ -260,7 +260,7 @@ class Problem:
     ) -> dict[int, Any]:
         """Run in forward mode. Return a dictionary of the states after the given numbers of ``steps``.
 
-        ``directions`` are tangents by parameter name. ``observe`` is called with the number and the tangent of every
+        ``directions`` are tangents by parameter name. The run calls ``observe`` with the number and the tangent of each
         state. The next step overwrites the tangent.
         """
         return self.several_tangents(parameters, [(directions, observe)], steps)

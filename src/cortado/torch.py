@@ -1,8 +1,8 @@
 """Cortado as a layer of PyTorch: see `docs/torch.md`.
 
 States are dictionaries of tensors by field name, with their ``time`` [s]. The tensors have the simulation's precision
-and are on its device. Parameters are dictionaries with the names of `Problem`. All functions support forward mode,
-reverse mode and `torch.vmap`; second derivatives raise an error.
+and are on its device. Parameters are dictionaries by parameter name, as in `Problem`. All functions support forward
+mode, reverse mode and `torch.vmap`; second derivatives raise an error.
 """
 
 from collections.abc import Mapping

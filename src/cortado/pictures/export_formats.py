@@ -27,7 +27,7 @@ Advance = Callable[[], None]
 
 
 def write_glb(run: Exported, folder: Path, advance: Advance) -> Path:
-    """Write the y axis upwards and colours as linear numbers, as glTF requires."""
+    """Write the y axis as the upward axis, and linear colours, as glTF requires."""
     import trimesh
 
     upright = Pose(run.up, np.zeros(3)).matrix
@@ -263,7 +263,7 @@ def export(
     if to not in FORMATS:
         raise InputError(f"to is {shown(to)}, but must be one of {', '.join(FORMATS)}.")
     if not len(trajectory):
-        raise InputError("The trajectory has no frame, but must have one to be exported.")
+        raise InputError("The trajectory has no frames, but an export needs at least one.")
     of, into = as_scene(scene), Path(as_path("folder", folder))
     phases = 1 if trajectory.mass_fractions is None else trajectory.mass_fractions.shape[-1]
     if of.dimension != trajectory.dimension or len(of.phase) != phases:

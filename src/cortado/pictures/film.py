@@ -37,9 +37,9 @@ from cortado.simulation import Simulation
 from cortado.version import __version__
 
 Computed = Callable[[], Simulation] | None
-"""A function that makes the simulation for colours that were not recorded."""
+"""A function that returns a simulation, which computes colours that the run did not record."""
 Around = tuple[tuple[int, ...], tuple[int, ...]]
-"""Frame numbers before and after a frame, each sorted from the nearest number."""
+"""Frame numbers before a frame, and after the frame, both in order of distance from the frame."""
 ALONE: Around = (), ()
 Panel = Callable[[int, Around], Points]
 """A function that draws a frame as a linear picture (rows, columns, 3) from 0 to 1."""

@@ -148,7 +148,7 @@ def _covered(shape: tuple[int, int], texts: tuple[Text, ...], size: int) -> tupl
 
 
 def lined(image: Points, lines: Sequence[Points], colour: Points, width: int) -> Points:
-    """Draw lines through points (k, 2), column and row, on a linear picture. ``width`` is in pixels."""
+    """Draw lines on a linear picture through points (k, 2), given by column and row. ``width`` is in pixels."""
     from PIL import Image, ImageDraw
 
     rows, columns = image.shape[:2]

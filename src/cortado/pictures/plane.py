@@ -19,11 +19,11 @@ from cortado.scene.shape_tables import BoxContainer
 LIGHT = (-0.45, 0.70, 0.55)
 """Direction to the lamp: right, up, and towards the viewer."""
 BLUR, DROPPED, AROUND = 0.022, 0.020, 0.12
-"""Softness, downward offset and greatest distance of shadows, relative to the size of the contents."""
+"""Softness, downward offset and greatest distance of shadows, relative to the greater side of the region."""
 Layer = tuple[Points, Points]
 """Opacity (rows, columns, 1) and colours (rows, columns, 3) of one layer of a picture."""
 SUPPORT = 1.3
-"""Distance from a particle at which its contribution to the drawn fluid vanishes [spacings]."""
+"""Distance [spacings] from a particle at which the particle's contribution to the drawn fluid vanishes."""
 
 
 def glossy(cover: Points, colour: Points, width: float, gleaming: float = 0.55) -> Points:

@@ -40,7 +40,7 @@ def film_side_by_side(
     device: str = "cpu",
     **settings: Any,
 ) -> Film:
-    """Write a film of up to nine runs side by side, an mp4 or webp as in `Trajectory.film`, and return it.
+    """Write and return a film of up to nine runs side by side, an mp4 or webp file as in `Trajectory.film`.
 
     All runs share the clock, the camera, the colour scale and the table [picture] of the first scene. At each time of
     the film, each run shows its recorded frame with the nearest time. An ended run shows its last frame.
@@ -62,7 +62,7 @@ def film_side_by_side(
     """
     given = runs.values() if isinstance(runs, Mapping) else runs
     if not isinstance(given, Iterable) or isinstance(runs, Trajectory):
-        raise InputError(f"runs is {shown(runs)}, but must be several trajectories, with labels or without.")
+        raise InputError(f"runs is {shown(runs)}, but must be several trajectories, in a list or by label.")
     each = list(given)
     for run in each:
         if not isinstance(run, Trajectory):
@@ -85,7 +85,7 @@ def film_side_by_side(
 def shown_alike(scenes: Sequence[Scene], runs: Sequence[Trajectory], settings: Mapping[str, Any]) -> list[Scene]:
     """Return scenes with the same table [picture]. Raises `InputError` for runs that one film cannot show."""
     if not 0 < len(scenes) <= MOST_PICTURES:
-        raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} can be side by side.")
+        raise InputError(f"There are {len(scenes)} runs, but 1 to {MOST_PICTURES} runs fit into a film.")
     if len({scene.dimension for scene in scenes}) > 1:
         raise InputError("Some runs are in 2-D and some in 3-D, but all must have the same dimension.")
     for scene, run in zip(scenes, runs, strict=True):
@@ -144,7 +144,7 @@ def common_times(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def interval_of(times: NDArray[Any]) -> float:
-    """Return the typical time between two frames [s], or infinity for a single frame."""
+    """Return the median time between two frames [s], or infinity for a single frame."""
     return float(np.median(np.diff(times))) if len(times) > 1 else np.inf
 
 

@@ -21,7 +21,7 @@ Box = tuple[Points, Points]
 TINT = 2.6
 """Ratio of absorption to scattering for fluids without a material."""
 SPAN = 0.1
-"""Thickness of fluid in the definition of transparency, relative to the size of the contents."""
+"""Thickness of fluid in the definition of transparency, as a fraction of `Stage.size`."""
 
 
 def thinned(positions: Points | Sequence[Points], domain: Domain = WITHOUT_PERIODS) -> list[Points]:

@@ -94,8 +94,8 @@ class Video:
 
 @contextmanager
 def writing(path: str | Path, frames_per_second: float = 25.0, note: str = "", count: int = 0) -> Iterator[Video]:
-    """Open a video, which appears under its path at the end of the ``with`` block. After an interruption the next call
-    with the same ``note`` and ``count`` continues after the finished frames.
+    """Open a video, which appears under its path at the end of the ``with`` block. After an interruption, a call with
+    the same ``note`` and ``count`` continues after the finished frames.
 
     ``count`` is the number of frames of the complete video. ``note`` is a text about the content, stored in the file.
     ``frames_per_second`` is approximate: the file stores the exact time of each frame."""

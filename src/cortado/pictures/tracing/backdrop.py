@@ -20,7 +20,7 @@ class LitSurface:
     """Outward unit normals at the vertices (points,)."""
     colours: Vec3s
     light: Vec3s
-    """Light on each vertex (points,). Light of 1 gives a white surface the brightness 1."""
+    """Light on each vertex (points,). The light 1 gives a white surface the brightness 1."""
     media: Vec2s
     """Scattering and absorption coefficients of the fluid at each vertex (points,) [1/m]."""
     is_flat: wp.int32
@@ -116,7 +116,7 @@ class Environment:
     size: wp.float32
     """Greatest side of the box around the fluid and the container [m]."""
     nearest: wp.float32
-    """Smallest distance along a ray at which a hit counts [m]."""
+    """Smallest distance [m] along a ray between the start and a hit."""
     segments: wp.int32
     sun: wp.vec3
     fill: wp.vec3
@@ -204,7 +204,7 @@ def shadow_at(s: Environment, shadow: Vec3s2d, x: wp.float32, z: wp.float32):
 
 @wp.func
 def line(x: wp.float32, grid: wp.float32, width: wp.float32):
-    """Return 1 on the lines of a grid and 0 between them. Lines thinner than a pixel fade."""
+    """Return 1 on the lines of a grid and 0 between the lines. Lines thinner than a pixel fade."""
     off = wp.abs(x / grid - wp.round(x / grid)) * grid
     return 1.0 - smooth_step(0.35 * width, width, off)
 
@@ -248,7 +248,7 @@ def between(lower: wp.float32, upper: wp.float32, o: wp.float32, d: wp.float32, 
 
 @wp.func
 def within_tube(lower: wp.vec3, upper: wp.vec3, o: wp.vec3, d: wp.vec3):
-    """Return the interval of a ray inside an upright cylinder in a box, or (FAR, -FAR) for a miss."""
+    """Return the interval of a ray inside the upright cylinder of a box, or (FAR, -FAR) for a miss."""
     radius = 0.5 * (upper[0] - lower[0])
     x = o[0] - 0.5 * (lower[0] + upper[0])
     z = o[2] - 0.5 * (lower[2] + upper[2])

@@ -68,7 +68,7 @@ def spheres(positions: Points, colours: Points, spacing: float) -> Mesh:
 
 @cache
 def _sphere(levels: int) -> tuple[Points, np.ndarray]:
-    """Return the vertices (k, 3) of a unit sphere, an octahedron whose triangles are divided ``levels`` times."""
+    """Return vertices (k, 3) and triangles of a unit sphere: an octahedron, divided ``levels`` times."""
     octants = np.array([np.diag(signs) for signs in product((1.0, -1.0), repeat=3)])
     triangles = np.array([one if np.linalg.det(one) > 0.0 else one[[0, 2, 1]] for one in octants]) + 0.0  # no -0
     for _ in range(levels):
@@ -91,7 +91,7 @@ WeightedLook = wp.types.vector(6, wp.float32)
 MOST_CELLS = 1 << 26
 """Greatest number of cells in the grid that finds near particles."""
 CLEAREST = wp.constant(wp.float32(1.0e-3))
-"""Small value that is added to scattering and absorption before the logarithm [1/m]."""
+"""Small value [1/m] that `tint` adds to scattering and absorption before the logarithm."""
 WITHIN, ASIDE = wp.constant(wp.float32(10.62)), wp.constant(wp.float32(1.93))
 DROP, SHEET = wp.constant(wp.float32(0.82)), wp.constant(wp.float32(0.74))
 """Factors that reduce the volumes of isolated particles and of particles in thin sheets."""

@@ -22,13 +22,13 @@ from cortado.pictures.tracing.near_particles import Floats, Looks, Particles, Ve
 NODES = 320
 """Number of floor nodes along each axis at which the shadow is computed."""
 ABOVE = 1e-3
-"""Greatest height of a solid's surface that lies on the floor, as a fraction of `Stage.size`."""
+"""Greatest height of faces of solids without a shadow, as a fraction of `Stage.size`."""
 REACH = 1.5
 """Half the width of the floor area with shadows, as a multiple of `Stage.size`."""
 KEY, AROUND = 0.022, 0.05
 """Widths of the blur of the lamp's shadow and of the sky's shadow, as fractions of `Stage.size`."""
 CLOSE = 0.15
-"""Greatest height of objects that shade the floor from the sky, relative to the size of the contents."""
+"""Greatest height of objects that shade the floor from the sky, as a fraction of `Stage.size`."""
 SKY = 0.32
 Soften = Callable[[wp.array], wp.array]
 
@@ -218,7 +218,7 @@ class SolidSurfaces:
 
     @property
     def kinds(self) -> tuple[bool, bool]:
-        """Two flags: whether there are opaque solids, and whether there are transparent solids."""
+        """Two flags: True if there are opaque solids, and True if there are transparent solids."""
         clear = [_is_clear(one) for one in self._stage.solids]
         return not all(clear), any(clear)
 

@@ -86,7 +86,7 @@ def _ways(points: Points, shown: ShownSolid, touching: float, spacing: float) ->
 
 
 TOUCHING, TOUCHING_SOLID, TOUCHING_ROUND = wp.constant(wp.float32(0.8)), 1.1, wp.constant(wp.float32(1.5))
-"""Greatest distances at which particles touch a flat wall, a solid, and a round wall [spacings]."""
+"""Greatest distances [spacings] of touching particles from a flat wall, a solid, and a round wall."""
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -257,7 +257,7 @@ class SpacePainter:
         )
         shading = self._trace, self._illuminates
         self._kernels = *shading, trace.find_contrast, list_marked, turn, cast, cell_kernels(FLOAT32).count
-        """Kernels of a picture, listed so that their modules compile in parallel."""
+        """Kernels of a picture. `compile_ahead` compiles the modules of these kernels in parallel."""
         self._effort, is_liquid = trace.effort_of(stage.picture), stage.picture.surface == "liquid"
         self._lamps = self._rays_to_light(*(self._effort.lights if is_liquid else trace.SPHERE_LIGHTS))
         self._lamps_of_solids = self._rays_to_light(*trace.SOLID_LIGHTS)
@@ -273,7 +273,7 @@ class SpacePainter:
             return self._rays(*self.scenery(State(*state)))
 
     def still(self, state: State) -> Any:
-        """Return None if the fluid is not drawn as a surface."""
+        """Prepare a frame for averages. Return None if the picture has no fluid surface."""
         with WARP:
             compile_ahead(self, self.device)
             stage, s, particles, shadow = self._placed(state)

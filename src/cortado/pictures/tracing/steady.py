@@ -1,6 +1,6 @@
 """Average the drawn surface over frames of a film, because fluid at rest would flicker. Particles of fluid at rest
 drift by fractions of a spacing. In each block of the lattice, the change of the mean density measures how far the fluid
-moves between frames. Moving fluid and drops are drawn unchanged."""
+moves between frames. Moving fluid and drops are not averaged."""
 
 from collections.abc import Sequence
 from itertools import takewhile
@@ -35,7 +35,7 @@ TOUCHING = wp.constant(27)
 
 @wp.struct
 class Still:
-    """The fluid in one frame of a film, prepared for averages over frames."""
+    """Fluid of one frame of a film, prepared for averages over frames."""
 
     b: Blocks
     blocks: Ints

@@ -186,7 +186,7 @@ class Cubes:
 
 @wp.func
 def signs_of(b: Blocks, node: wp.vec3i):
-    """Return a bit mask of the nodes inside the fluid. The node at (x, y, z) has the bit x + 2 y + 4 z."""
+    """Return a bit mask of the nodes inside the fluid. The bit x + 2 y + 4 z stands for the node at (x, y, z)."""
     signs = wp.int32(0)
     for n in range(8):
         if level_at(b, node + wp.vec3i(n & 1, (n >> 1) & 1, n >> 2)) > LEVEL:

@@ -1,9 +1,9 @@
 """A ray tracer for a fluid surface that reflects, refracts, absorbs and scatters light.
 
-Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light is scattered light. Scattered light has
-the fluid's colour and the brightness of the light on the fluid's surface. The remaining light is multiplied by
-colour^(absorption L), by the Beer-Lambert law. Along the whole ray, the fluid has the optical properties of the point
-at which the ray enters.
+Over a length L in fluid, the fraction 1 - exp(-scattering L) of the ray's light becomes scattered light. Scattered
+light has the fluid's colour and the brightness of the light on the fluid's surface. By the Beer-Lambert law, absorption
+multiplies the remaining light by colour^(absorption L). Along the whole ray, the fluid has the optical properties of
+the point at which the ray enters.
 """
 
 from functools import cache
@@ -129,7 +129,7 @@ def illuminate_kernel(has_opaque: bool, has_clear: bool) -> Any:
 
 INDEX = wp.constant(wp.float32(1.33))
 FAINT = wp.constant(wp.float32(0.05))
-"""Greatest reflectance of the fluid's surface at which a ray is not split."""
+"""Reflectance of the fluid's surface above which a ray is split."""
 DARK = wp.constant(wp.float32(10.0))
 """Number of mean free paths in fluid after which light is neglected."""
 
