@@ -59,7 +59,7 @@ class SceneError(CortadoError):
     """An error in a scene, with the exit code 2. The message names the key, the wrong value and the allowed values."""
 
     def __init__(self, file: str | None, field: str, found: Any = None, wanted: str = "", sentence: str | None = None):
-        """Store the message's parts. ``sentence`` replaces "is <found>, but must be <wanted>"."""
+        """``sentence`` replaces the part of the message "is <found>, but must be <wanted>"."""
         super().__init__(file, field, found, wanted, sentence)
         self.file = file
         """Path of the scene file as the user gave it, or None for a scene built in Python."""
@@ -71,7 +71,6 @@ class SceneError(CortadoError):
         self.sentence = sentence or f"is {shown(found)}, but must be {wanted}."
 
     def in_file(self, file: str) -> "SceneError":
-        """Return a copy of this error with the name of the scene file."""
         _, *rest = self.args
         return SceneError(file, *rest)
 
@@ -107,7 +106,6 @@ class DivergedError(ComputationError):
         return DivergedError(self.step, self.particle, advice, self.where, self.others, self.preface)
 
     def among_others(self, preface: str) -> "DivergedError":
-        """Return a copy of this error with ``preface`` at the beginning of its message."""
         return DivergedError(self.step, self.particle, self.advice, self.where, self.others, preface)
 
     def __str__(self) -> str:

@@ -49,8 +49,7 @@ class Executor(ABC):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the results of ``function`` for all ``items``, in the order of the items. ``on_result`` is called for
-        each result.
+        """Return results of ``function`` in the order of the ``items``. ``on_result`` is called for each result.
 
         Large data, such as a problem, should be part of the function. The error of the first failed item is raised.
         """
@@ -140,11 +139,9 @@ class Distributed(Executor):
     def map(
         self, function: Callable[[Item], Result], items: Iterable[Item], on_result: OnResult | None = None
     ) -> list[Result]:
-        """Return the results of ``function`` for all ``items``; see `Executor.map`. The computation begins with the
-        first available worker.
+        """Return the results of ``function`` for all ``items``; see `Executor.map`. `map` starts with the first worker.
 
-        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` if there are no
-        workers.
+        Raises `InputError` if the function or an item cannot be pickled, and `ComputationError` without workers.
         """
         _check_call(function, items, on_result)
         return _Map(self, Payload.of(function), on_result).results(items)

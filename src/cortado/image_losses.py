@@ -57,8 +57,7 @@ class SquaredDifference:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """An image loss: a weighted sum of mean squared differences, one for each level of a Gaussian pyramid (Burt and
-    Adelson 1983).
+    """An image loss: a weighted sum of mean squared differences at levels of a Gaussian pyramid (Burt & Adelson 1983).
 
     The first level is the image. Each further level is the previous level, blurred and halved in size. Coarse levels
     locate a shape that does not overlap its target. Fine levels compare outlines.
@@ -69,8 +68,7 @@ class Pyramid:
     """
 
     levels: int | None = None
-    """Number of levels, by default the number of weights. Without weights, the coarsest level has at most 2 x 2
-    pixels."""
+    """Number of levels. The default is the number of weights, or levels down to at most 2 x 2 pixels."""
     weights: tuple[float, ...] | None = None
     """Weights of the levels (levels,) from fine to coarse. Weights should increase, as blur makes shapes fainter."""
 

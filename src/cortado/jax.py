@@ -3,8 +3,7 @@
 States are dictionaries of arrays by field name, with the ``time`` [s]. Parameters have names as in `Problem`.
 
 All functions are differentiable in forward and reverse mode, run as batches under `jax.vmap`, and work inside `jax.jit`
-and `jax.lax.scan`. Second derivatives raise an error. In compiled programs, Cortado's error message is a part of JAX's
-error message.
+and `jax.lax.scan`. Second derivatives raise an error. In compiled programs, JAX's error contains Cortado's message.
 """
 
 from cortado.calls import face

@@ -140,8 +140,7 @@ class Problem:
         The backward pass computes all other states again.
 
         ``state`` is the first state, or a list with one first state for each scene of a batch; see `Simulation.state`.
-        With a given ``state``, parameters apply to the steps after this state, and parameters for initial values raise
-        an error.
+        With a ``state``, parameters apply to the steps after this state, and initial-value parameters raise an error.
         """
         if not isinstance(simulation, Simulation):
             raise InputError(f"simulation is a {type(simulation).__name__}, but must be a cortado.Simulation.")
@@ -167,8 +166,8 @@ class Problem:
 
     @in_turn
     def value(self, parameters: Values) -> Any:
-        """Return the loss at ``parameters``: a number, or an array (batch,) for a batch of scenes. The loss is NaN for
-        scenes in `lost`."""
+        """Return the loss at ``parameters``: a number, or for a batch an array (batch,) with NaN for scenes in
+        `lost`."""
         return self._losses.total(self._ends(self._checked(parameters), self._losses, keep=False), self._going)
 
     def end(self, parameters: Values) -> Any:
@@ -227,8 +226,7 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Run forward, and return the forward pass, from which backward passes start. The forward pass keeps its stored
-        states in memory."""
+        """Return a forward pass, from which backward passes start. The pass keeps its stored states in memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself
@@ -324,8 +322,7 @@ class Problem:
         return [lost[b] if b in lost else found.member(b, shapes) for b in range(len(points))]
 
     def beginning_at(self, state: RestartState | Sequence[RestartState]) -> "Problem":
-        """Return a problem that begins at the given ``state``. The returned problem shares the arrays of the original
-        problem."""
+        """Return a problem that begins at ``state``. The returned problem shares the arrays of the original problem."""
         found, judged = object.__new__(Problem), self.simulation.judged_states
         states = [one if one in judged else one.fixed() for one in one_for_each(state, self.simulation.batch)]
         found.__dict__ |= {**self.__dict__, "state": state, "_states": states, "_batches": {}}
@@ -366,14 +363,12 @@ class Problem:
         return "; ".join([f"{self.steps} steps", simulation.precision.name, *checksums, energies, *told])
 
     def iterations(self) -> np.ndarray:
-        """Return the number of pressure iterations in each step (steps,) of the last evaluation, for solvers with a
-        single iteration loop."""
+        """Return the pressure iterations (steps,) of the last evaluation, for solvers with a single iteration loop."""
         return noted(self.diagnostics, "iterations")
 
     @property
     def diagnostics(self) -> Mapping[str, np.ndarray]:
-        """Diagnostics of each step (steps,) in the last evaluation, by name, such as ``converged``. The names depend on
-        the solver."""
+        """Diagnostics (steps,) of the last evaluation by name, such as ``converged``. The solver sets the names."""
         return self._rollout.diagnostics
 
     def _checked(self, parameters: Values) -> Arrays:

@@ -120,8 +120,7 @@ class Simulation(Stepping):
         self.free_energy = FREE_ENERGIES[scene.mixture.free_energy] if free_energy is None else free_energy
         self.smoothing = discrete.kernel
         self.walls, self.wall_solids = discrete.walls.positions, discrete.walls.solid
-        """Positions (b, d) [m] of wall particles, and solid numbers (b,) of wall particles from `wall_numbers`, with -1
-        for the container."""
+        """Positions (b, d) [m] of wall particles, and solids (b,) from `wall_numbers`, or -1 for the container."""
         self.lattice, self.masses = discrete.lattice, discrete.masses
         """Constants of the rest lattice, and the actual and the prescribed masses [kg] of the fluid."""
         self.free_particles = discrete.fluid.emitted.start
@@ -192,8 +191,7 @@ class Simulation(Stepping):
             sensors: sensors by name, in addition to the scene's sensors. All sensors are read in every step; see
                 `cortado.sensors`.
             observe: a function that is called with the number of each step, to show progress.
-            time: duration [s] in place of ``steps``. The run ends with the first step that ends at this time or
-                later.
+            time: duration [s] in place of ``steps``. The run ends with the first step that reaches this time.
 
         `run` warns if the pressure did not converge. A lost particle causes a `DivergedError`, or in a batch a warning.
         """
@@ -281,8 +279,7 @@ class Simulation(Stepping):
             name: name of the quantity.
             of: a state of this simulation, a sequence with one state for each scene of a batch, or a trajectory. The
                 default is the initial state of the scene.
-            controls: parameters of the step that starts at the state, as in `run`. For a trajectory, give the
-                controls of its run.
+            controls: parameters of the step that starts at the state, as in `run`. A trajectory needs its run's controls.
 
         Returns:
             float64 (n,) or (n, k) in the order of the scene, for a trajectory (frames, n, ...). A load has the shape
@@ -343,8 +340,7 @@ class Simulation(Stepping):
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
         """Render a film of a ``trajectory`` on the device of the simulation and write it to ``path``. For ``settings``
-        see `Trajectory.film`. The film computes the quantity of ``colour``, such as the pressure, if the run did not
-        record it."""
+        see `Trajectory.film`. The film computes a quantity of ``colour`` that the run did not record."""
         return on_top("simulation_film")(self, trajectory, path, settings)
 
     @property

@@ -50,8 +50,7 @@ class Steps(torch.nn.Module):
         self.trained, self._names = torch.nn.ParameterDict(trained_by_key), tuple(made)
 
     def forward(self, given: Tensors, parameters: Tensors | None = None) -> dict[str, "torch.Tensor"]:
-        """Return the state after the steps. ``parameters`` are additional parameters, which the module does not
-        train."""
+        """Return the state after the steps. ``parameters`` are additional, untrained parameters."""
         own = {name: self.trained[name.replace(".", "/")] for name in self._names}
         for name in parameters or {}:
             if name in own:

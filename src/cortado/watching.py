@@ -56,8 +56,7 @@ class Watch:
     def run(
         self, is_frame: Callable[[int], bool], record: Observer, observe: Callable[[int], object] | None = None
     ) -> State:
-        """Run the rollout and return its last state. After an error or an interrupt, `run` still reads and records all
-        earlier states."""
+        """Run the rollout and return its last state. An error or an interrupt does not lose earlier states."""
 
         def look(step: int, state: State) -> None:
             if is_frame(step):

@@ -263,7 +263,7 @@ def with_volume(
 
 
 def _bodies(points: Points, triangles: np.ndarray, places: Points, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Number the bodies of fluid. Return the numbers for surface points (p,) and particles (n,), or -1 for no body."""
+    """Return the number of the fluid body, or -1, for each surface point (p,) and for each particle (n,)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree

@@ -167,8 +167,8 @@ def _too_many(path: str | Path, found: str, most: int) -> InputError:
 
 @public
 def write_picture(path: str | Path, image: ArrayLike) -> Path:
-    """Write a linear ``image`` (rows, columns, 3) to a PNG file at ``path`` with 8 bits of sRGB. Values are clipped to
-    0..1. Return the path.
+    """Write a linear ``image`` (rows, columns, 3) to a PNG file at ``path`` with 8 bits of sRGB. Clip values to 0..1.
+    Return the path.
 
     Raises:
         InputError: the image has a wrong shape, is an array of integers, or has values that are not finite or look like

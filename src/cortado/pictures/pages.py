@@ -63,8 +63,8 @@ def script() -> str:
 
 
 def thinned(frames: int, particles: int, numbers: int, most_bytes: int = 2_200_000) -> tuple[NDArray[np.intp], int]:
-    """Return frame numbers, and k for every k-th particle, for an animation of at most ``most_bytes``. A particle needs
-    ``numbers`` bytes per frame."""
+    """Return frame numbers, and k for every k-th particle, for an animation of at most ``most_bytes``. ``numbers`` is
+    the number of bytes per particle and frame."""
     count = min(frames, 120, max(most_bytes // (numbers * particles), 24))  # 24 to 120 of them
     stride = max(-(-count * numbers * particles // most_bytes), 1)
     return np.unique(np.linspace(0, frames - 1, count).astype(int)), stride
@@ -192,7 +192,7 @@ MOST_NUMBERS = 6
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a report. The report omits empty parts of the section."""
+    """A section of a report, in which empty parts are left out."""
 
     title: str
     words: Sequence[object] = ()

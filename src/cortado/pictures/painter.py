@@ -40,13 +40,12 @@ def painter(
 
 
 def stage_of(scene: Scene, positions: Points | Sequence[Points], poses: Iterable[Scene] = ()) -> PlaneStage | Stage:
-    """Return a stage for positions (n, d) or (frames, n, d) [m]. The picture has room for the solids of all
-    ``poses``."""
+    """Return a stage for positions (n, d) or (frames, n, d) [m]. Pictures have room for the solids of all ``poses``."""
     return (PlaneStage if scene.dimension == 2 else Stage).of(scene, positions, poses)
 
 
 def colours_of(scene: Scene, mass_fractions: Points | None, particles: int, colours: Points | None = None) -> Points:
-    """Mix linear colours (n, 3) from the phases' ``colours`` (phases, 3), by default from the scene."""
+    """Mix linear colours (n, 3) of particles from phase ``colours`` (phases, 3), by default the scene's colours."""
     palette = np.array([phase.colour for phase in scene.phase]) if colours is None else np.asarray(colours)
     fractions = np.ones((particles, 1)) if mass_fractions is None else np.asarray(mass_fractions)
     return mixed(fractions, np.clip(palette, 0.0, 1.0))

@@ -89,8 +89,7 @@ def panels(
     true: ArrayLike | None = None,
     start: ArrayLike | None = None,
 ) -> Path:
-    """Plot ``found`` (k, c) against ``x`` (k,). The curves ``true`` and ``start`` are arrays (k, c), or (c,) if
-    constant."""
+    """Plot ``found`` (k, c) against ``x`` (k,). Curves ``true`` and ``start`` are (k, c), or (c,) if constant."""
     x, found = np.asarray(x), np.asarray(found, dtype=float)
     count = found.shape[1]
     with drawing(path, height=1.6 + 1.9 * count) as figure:

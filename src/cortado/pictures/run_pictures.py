@@ -45,8 +45,7 @@ Given = Scene | str | Path | None
 def run_pictures(
     scene: Scene, trajectory: Trajectory, folder: Path, device: Any, values: NDArray | None = None
 ) -> Figures:
-    """Draw a run. Return captions and paths. Film and contact sheet have the quality of the scene, by default
-    "quick"."""
+    """Return captions and paths of a run's pictures. The default quality of film and contact sheet is "quick"."""
     run, last, picture = ShownRun(scene, trajectory, values), len(trajectory) - 1, scene.picture or Picture()
     page, is_quick = run_page(run, device), picture.quality is None and scene.dimension == 3
     stills: Figures = []

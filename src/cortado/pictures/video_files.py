@@ -38,8 +38,7 @@ class Video:
         self.frames = 0
 
     def add(self, image: ArrayLike, time: float) -> None:
-        """Add a frame from ``time`` [s] on. The last row or column is repeated if the number of rows or columns is
-        odd."""
+        """Add a frame from ``time`` [s] on. If the number of rows or columns is odd, the last one is repeated."""
         from av import VideoFrame
 
         pixels = to_srgb(image, self._helpers.map)

@@ -180,8 +180,7 @@ def still_of(level: tuple[Any, wp.array], s: Any, light: wp.array, launch: BandL
 
 
 def steadied(own: Any, before: Sequence[Any], after: Sequence[Any], spacing: float, launch: BandLauncher) -> Any:
-    """Average the frame ``own`` with earlier frames ``before`` and later frames ``after``, both in order of
-    distance."""
+    """Average the frame ``own`` with frames ``before`` and ``after`` this frame, both in order of distance."""
     before, after = (list(takewhile(lambda other: other.b.cube == own.b.cube, side)) for side in (before, after))
     if not before and not after:
         return own

@@ -1,7 +1,6 @@
 """The isosurface of a fluid density as a surface net of quadrilaterals (Gibson 1998). The net has one corner in each
 lattice cube that the surface crosses, and a quadrilateral for each crossed edge of a cube. Blocks of `WIDTH` cubes
-along each axis divide the lattice. The density, called ``level`` in names, is computed only in blocks that may contain
-the surface."""
+along each axis divide the lattice. The density (``level``) is computed only in blocks that may contain the surface."""
 
 from dataclasses import dataclass
 from typing import Any
