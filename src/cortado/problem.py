@@ -226,7 +226,7 @@ class Problem:
 
     @in_turn
     def forward_pass(self, parameters: Values) -> ProblemForwardPass:
-        """Return a forward pass, from which backward passes start. The pass keeps its stored states in memory."""
+        """Return a forward pass, from which backward passes start. A forward pass keeps its states in memory."""
         values = self._checked(parameters)
         ends = self._ends(values, self._losses, keep=True, varied=values)
         residual = Residual(self._rollout)  # before the loss, which may evaluate the problem itself

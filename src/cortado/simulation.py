@@ -279,7 +279,7 @@ class Simulation(Stepping):
             name: name of the quantity.
             of: a state of this simulation, a sequence with one state for each scene of a batch, or a trajectory. The
                 default is the initial state of the scene.
-            controls: parameters of the step that starts at the state, as in `run`. A trajectory needs its run's controls.
+            controls: parameters of the step that starts at the state, as in `run`, or controls of the trajectory's run.
 
         Returns:
             float64 (n,) or (n, k) in the order of the scene, for a trajectory (frames, n, ...). A load has the shape
