@@ -137,7 +137,8 @@ def reduction(size: int) -> Any:
     """Return a sparse matrix (ceil(size / 2), size) that blurs a line of pixels and keeps every second pixel.
 
     For an odd size, Burt and Adelson's weights 1 4 6 4 1 are centred on every second pixel, beginning with the first.
-    For an even size, the weights are 1 3 3 1. At an edge the weights are normalised: a constant image remains constant.
+    For an even size, the weights of pixels are 1 3 3 1. At an edge the weights are normalised: a constant image remains
+    constant.
     """
     from scipy.sparse import csr_array
 

@@ -69,7 +69,7 @@ class ProblemForwardPass(Staying):
     @in_turn
     def back_to_state(self, estimator: AdjointEstimator) -> tuple[Arrays, Arrays]:
         """Return the gradient with respect to the parameters, and the derivatives with respect to the first state, both
-        from ``estimator``. The keys of the second dictionary are the state's field names and ``time``."""
+        from ``estimator``. The keys of the state's derivatives are field names and ``time``."""
         rollout = self._residual.rollout
         derivative = backward_step(rollout, estimator)
         first, gradient = self._backward(derivative)

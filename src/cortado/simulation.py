@@ -340,7 +340,7 @@ class Simulation(Stepping):
 
     def film(self, trajectory: Trajectory, path: str | Path, **settings: Any) -> Film:
         """Render a film of a ``trajectory`` on the device of the simulation and write it to ``path``. For ``settings``
-        see `Trajectory.film`. The film computes a quantity of ``colour`` that the run did not record."""
+        see `Trajectory.film`. If the run did not record the quantity of ``colour``, the film computes it."""
         return on_top("simulation_film")(self, trajectory, path, settings)
 
     @property

@@ -28,7 +28,7 @@ from cortado.pictures.tracing.surface_net import level_blocks, net_of, normals_o
 NEIGHBOURS = 24
 """Number of particles that are averaged for the colour of a surface point."""
 ROUND = 10_000
-"""Greatest number of spheres with 128 triangles each. In larger numbers, spheres have 32 triangles each."""
+"""Greatest number of spheres with 128 triangles each. If there are more spheres, each sphere has 32 triangles."""
 
 
 @dataclass(frozen=True)
