@@ -25,7 +25,7 @@ from cortado.scene.solids import SolidTable
 from cortado.solvers.particle_derivatives import ParticleAdjoint, ParticleTangent
 from cortado.solvers.particles import ParticleSolver
 from cortado.solvers.solver import Counts, Solver, WithinBar
-from cortado.sph.parts import StepContext, sort
+from cortado.sph.parts import StepContext, orders_of
 
 Given = Mapping[str, NDArray]
 Evaluator = Callable[[], "QuantityEvaluator"]
@@ -163,7 +163,7 @@ class QuantityEvaluator:
         solver, parameters, (given, own, state_bar) = self.solver, self._rollout.parameters, self._of_stress
         solver.reserve(counts)
         solver.replay(self._rollout.initial, parameters, counts)
-        sort(solver.context(parameters), given, own.stress)
+        solver.context(parameters).launch(orders_of(own.stress).sort, a_scene=given, a=own.stress)
         self._pressure_adjoint.from_within(counts, own, state_bar, parameters)
 
     @cached_property

@@ -27,7 +27,7 @@ from cortado.runs.sensor import SensedScene
 from cortado.scene.motions import AXES
 from cortado.solvers.particles import ParticleSolver
 from cortado.sph.moving_solids import rotations
-from cortado.sph.parts import unsort
+from cortado.sph.parts import orders_of
 
 
 @wp.struct
@@ -217,7 +217,7 @@ class StepQuantities:
             if found.dtype is SIX:
                 wp.copy(own, found)
             else:
-                unsort(context, found, own)
+                context.launch(orders_of(found).unsort, a=found, a_scene=own)
 
     def of_step(self, name: str, step: int) -> wp.array:
         """Return a load, or a quantity in the order of the scene."""

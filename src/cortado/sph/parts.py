@@ -274,6 +274,7 @@ class Carried:
                 wanted = "one entry for each particle"
                 raise TypeError(f"field {field.name!r} has one entry, but must have {wanted}.")
         self._arrays = layout.state(fields, requires_grad)
+        self._orders = {name: orders_of(self._arrays[name]) for name in self._arrays.names}
 
     def __getitem__(self, name: str) -> wp.array:
         """Return the array (n,) of a field at the start of the step, in sorted order."""
@@ -281,26 +282,18 @@ class Carried:
 
     def sort(self, step: StepContext, state: State) -> None:
         for name in self._arrays.names:
-            sort(step, state[name], self._arrays[name])
+            step.launch(self._orders[name].sort, a_scene=state[name], a=self._arrays[name])
 
     def unsort(self, step: StepContext, values: Mapping[str, wp.array], state: State) -> None:
         if values.keys() != set(self._arrays.names):
             raise TypeError(f"the step sorts {', '.join(self._arrays.names)}, but was given {', '.join(values)}.")
         for name, a in values.items():
-            unsort(step, a, state[name])
+            step.launch(self._orders[name].unsort, a=a, a_scene=state[name])
 
 
-def sort(step: StepContext, a_scene: wp.array, a: wp.array) -> None:
-    """Copy the array ``a_scene`` (n,) from the order of the scene to sorted order."""
-    step.launch(_kernels(a).sort, a_scene=a_scene, a=a)
-
-
-def unsort(step: StepContext, a: wp.array, a_scene: wp.array) -> None:
-    """Copy the array ``a`` (n,) from sorted order to the order of the scene."""
-    step.launch(_kernels(a).unsort, a=a, a_scene=a_scene)
-
-
-def _kernels(a: wp.array) -> Any:
+def orders_of(a: wp.array) -> SimpleNamespace:
+    """Return the kernels that copy values like those of ``a`` (n,) from the order of the scene to sorted order (`sort`)
+    and back (`unsort`)."""
     module = kernel_module(f"order_{kind_of(True, a.requires_grad)}_{type_name(a.dtype)}", a.requires_grad)
     return order_kernels(a.dtype, module)
 
