@@ -9,8 +9,9 @@ Warp's own example.
 # mypy: ignore-errors
 # Kernels are Warp's language, not Python's: their annotations are types made in a factory.
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -34,7 +35,7 @@ class OneKernelTape(Tape):
         wrong = {topic: Kernels(loops[topic], None, None) for topic in self.topics}
         if "density" in wrong:
             step.solver.density = Density(step.solver.discretisation, "one_kernel_loops", wrong.pop("density"))
-        step.solver.kernels = replace(step.solver.kernels, **wrong)
+        step.solver.kernels = SimpleNamespace(**vars(step.solver.kernels) | wrong)
         return step
 
 
@@ -85,6 +86,8 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
     @wp.kernel(module=module)
     def pressure(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         stiffness: real,
         time_step: wp.array(dtype=real),
         n: wp.array(dtype=real),
@@ -99,11 +102,13 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
         error: wp.array(dtype=pair_of),
     ):
         i = s.first + wp.tid()
+        if k >= rounds[0]:
+            return
         total = real(0.0)
-        for k in range(s.fluid_count[i]):
-            total += weight(separation(x_star[i], x_star[s.neighbours[k, i]], s), s)
-        for k in range(s.fluid_count[i], s.count[i]):
-            b = s.neighbours[k, i]
+        for row in range(s.fluid_count[i]):
+            total += weight(separation(x_star[i], x_star[s.neighbours[row, i]], s), s)
+        for row in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[row, i]
             total += s.wall_weights[b] * weight(separation(x_star[i], s.wall_positions[b], s), s)
         excess = m[i] * s.volume * (real(1 - s.filling[i]) * s.self_weight + total) - rho_0[i]
         delta = y[i] * stiffness / (time_step[0] * time_step[0])
@@ -116,23 +121,31 @@ def one_kernel_loops(discretisation: Discretisation) -> dict[str, wp.Kernel]:
     @wp.kernel(module=module)
     def pressure_force(
         s: neighbourhood,
+        k: int,
+        rounds: wp.array(dtype=wp.int32),
         time_step: wp.array(dtype=real),
         m: wp.array(dtype=real),
         x: wp.array(dtype=vector),
         v: wp.array(dtype=vector),
         acceleration: wp.array(dtype=vector),
         c: wp.array(dtype=real),
+        x_before: wp.array(dtype=vector),
+        v_before: wp.array(dtype=vector),
         # out
         x_star: wp.array(dtype=vector),
         v_star: wp.array(dtype=vector),
     ):
         i = s.first + wp.tid()
+        if k >= rounds[0]:
+            x_star[i] = x_before[i]
+            v_star[i] = v_before[i]
+            return
         total = vector()
-        for k in range(s.fluid_count[i]):
-            j = s.neighbours[k, i]
+        for row in range(s.fluid_count[i]):
+            j = s.neighbours[row, i]
             total += (c[i] + c[j]) * gradient(separation(x[i], x[j], s), s)
-        for k in range(s.fluid_count[i], s.count[i]):
-            b = s.neighbours[k, i]
+        for row in range(s.fluid_count[i], s.count[i]):
+            b = s.neighbours[row, i]
             total += (s.wall_weights[b] * c[i]) * gradient(separation(x[i], s.wall_positions[b], s), s)
         dt = time_step[0]
         push = (-s.volume / m[i]) * total
