@@ -13,11 +13,10 @@ from cortado import Problem, Simulation, forces, gradients
 from cortado.device import launching
 from cortado.device.launching import KernelLauncher
 from scenes import MIXING, Weighed, box, jet, plane, plane_of_three, scene, splash, two_layers
-from test_faces import flume
+from test_faces import FLAP, flume
+from test_sheets import SCENES as SHEETS
 
 ROOT = Path(cortado.__file__).parent
-APART = "study/one_kernel_loops.py"
-"""Kernels of a study of Warp's tape, which is never cut."""
 BINGHAM = {"kind": "bingham", "yield_stress": 10.0, "regularisation": 0.5}
 FALL = {"gravity": [0.0, -9.81, 0.0]}
 STRESS = {"gravity": [1.0, -9.81, 0.0], "viscosity": "stress"}
@@ -49,7 +48,12 @@ CASES = {
     "velocities that follow": lambda: two_layers(solver=PROJECTION | {"velocities_follow": True}),
     "a solid that moves": lambda: scene(solid=[BALL | ALONG], solver=PROJECTION),
     "a solid that moves, PCISPH, stress": lambda: scene(forces=STRESS, solid=[BALL | ALONG]),
+    "a solid that moves, PCISPH, pairwise": lambda: scene(solid=[BALL | ALONG]),
     "a face that mirrors": flume,
+    "a face that mirrors, with the mean stress": lambda: flume(
+        {**FLAP, "slip": "no"}, forces={"gravity": [1.0, -9.81], "viscosity": "stress"}
+    ),
+    "sheets": SHEETS["plane"],
     "a solid that is free": lambda: scene(solid=[BALL | {"motion": "free", "density": 500.0}], solver=PROJECTION),
 }
 
@@ -74,7 +78,7 @@ class Seen(Weighed):
     """A linear loss of quantities that are sums over neighbours too."""
 
     def __init__(self, simulation):
-        names = ["vorticity", "wall_force", *(f"{solid.name}.load" for solid in simulation.scene.solid)]
+        names = ["pressure", "vorticity", "wall_force", *(f"{solid.name}.load" for solid in simulation.scene.solid)]
         random, first = np.random.default_rng(9), {name: simulation.quantity(name) for name in names}
         self.weights = {name: random.standard_normal(array.shape) for name, array in first.items()}
 
@@ -141,18 +145,15 @@ def test_any_number_of_ranges_gives_the_same_bits(name):
 
 
 def sums_over_neighbours() -> set[str]:
-    """Names of all kernels whose first argument is what lies around a particle, and of those that are made of what a
-    sum gives to solids."""
+    """Names of all kernels that a file writes and whose first argument is what lies around a particle, and of those
+    that are made of what a sum gives to solids."""
     names = set()
     for path in ROOT.rglob("*.py"):
-        if path.relative_to(ROOT).as_posix() == APART:
-            continue
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef) and node.name.endswith("_work") and node.args.args[-1].arg == "s":
-                names.add(f"{node.name}_share")
-            if isinstance(node, ast.FunctionDef) and any("wp.kernel" in ast.unparse(d) for d in node.decorator_list):
-                first = node.args.args[0].annotation if node.args.args else None
-                if first is not None and ast.unparse(first) == "neighbourhood":
+            if isinstance(node, ast.FunctionDef) and node.args.args:
+                if node.name.endswith("_work") and node.args.args[-1].arg == "s":
+                    names.add(f"{node.name}_share")
+                if "kernel" in " ".join(map(ast.unparse, node.decorator_list)) and node.args.args[0].arg == "s":
                     names.add(node.name)
     return names
 
