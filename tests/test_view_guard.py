@@ -334,7 +334,7 @@ def test_ctrl_c_ends_the_command_while_a_page_is_connected(file):
         command.send_signal(signal.SIGINT)
         out, err = command.communicate(timeout=3.0)  # of which Python needs most to end, on a busy machine
         page.socket.close()
-        err = [line for line in err.splitlines() if not line.startswith("Compiling")]  # of a machine that has no kernels
+        err = [line for line in err.splitlines() if not line.startswith("Compiling")]
         assert (command.returncode, out, err) == (0, "", [])
 
 
