@@ -14,11 +14,11 @@ import pytest
 
 import cortado.cli.optimise
 import cortado.cli.run
-import cortado.files.vtkhdf
 from bad_scenes import assert_one_sentence, assert_refused
 from bad_tasks import GOOD_TASK, PARTICLES, PLANE_PICTURE, TINY_LATTE, TINY_SCENE
 from cortado import Problem, Scene, Trajectory
 from cortado.files.disk import locked
+from cortado.files.vtkhdf import TrajectoryWriter
 from cortado.optimisation.solved_task import TaskFigures
 from cortado.optimisation.task_files import load_task
 from cortado.optimisation.transforms import TimeInterpolation
@@ -389,14 +389,13 @@ def test_a_folder_that_is_being_written_is_refused(cortado_command, command):
 @pytest.mark.parametrize("full", ["trajectory.vtkhdf", "metrics.jsonl", "run.mp4", "report.html"])
 def test_frames_stay_when_a_disk_fills_up(run, monkeypatch, full):
     Path("scene.toml").write_text(TINY_LATTE.partition("[problem]")[0])
-    replace, write = os.replace, cortado.files.vtkhdf.write_fully
-    left = iter(range(20))
+    replace, write = os.replace, TrajectoryWriter._write
 
-    def until_full(*arguments):
-        return refuse() if next(left, None) is None else write(*arguments)
+    def until_full(writer, *arguments):
+        return refuse() if writer.frames_written == 2 else write(writer, *arguments)
 
     if full == "trajectory.vtkhdf":
-        monkeypatch.setattr(cortado.files.vtkhdf, "write_fully", until_full)
+        monkeypatch.setattr(TrajectoryWriter, "_write", until_full)
     else:
         monkeypatch.setattr(os, "replace", lambda old, new: refuse() if Path(new).name == full else replace(old, new))
     code, out, err = run("--steps", 8)
