@@ -42,7 +42,7 @@ def test_every_size_and_every_pass_of_a_step_has_a_time_and_a_floor(found):
         for one in [*row["passes"], *row["adjoint_passes"], row["step"], row["rollout"], row["gradient"]]:
             assert one["ms"] > 0.0 and one["floor_ms"] > 0.0
     text = as_text(found)
-    assert all(text.count(f"\n{name} ") >= 2 for name in [*STEP, "step", "rollout", "gradient"])
+    assert all(f"\n{name} " in text for name in [*STEP, "step", "rollout", "gradient"])
     assert "27 particles" in text and "GB/s" in text
 
 
