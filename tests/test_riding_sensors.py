@@ -90,7 +90,7 @@ def test_what_a_sensor_beside_solids_makes_of_its_adjoint_is_its_derivative(dime
         if abs(derivative) < 1e-20:
             assert value(point) == value({name: point[name] + way[name] for name in point}), only
         else:
-            assert distance(value, point, way, derivative, [10.0, 1.0, 1e-1, 1e-2], enough=1e-4) < 1e-4, only
+            assert distance(value, point, way, derivative, [10.0, 1.0, 1e-1, 1e-2, 1e-3], enough=1e-4) < 1e-4, only
 
 
 # ---- derivatives through runs ------------------------------------------------------------------------------------
