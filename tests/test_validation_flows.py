@@ -270,13 +270,15 @@ BARE = {"pressure": False, "time": 0.06 / NU}
         ((1.0, 0.0), BARE, 0.2),
         ((10.0, 0.0), BARE, 2.0),
         ((10.0, 0.45), BARE, 2.0),
-        ((4.0, 0.45, "wendland_c2"), {"solver": "projection"}, 4.0),
+        ((4.0, 0.45, "wendland_c2"), {"solver": "projection", "apart": 0.1}, 4.0),
     ],
     ids=["slow", "fast", "sheared", "projection"],
 )
 def test_what_flows_between_plates(given, options, slid):
     """Rows slide past each other by 0.3 to 5 spacings; the flow and what it changes by with the viscosity, within 1 %
-    of the closed form, and so it is with the pressure of the projection."""
+    of the closed form, and so it is with the pressure of the projection. With that a flow swells by 0.2 % as rows pass
+    each other, earlier or later with the viscosity: a tangent is right, but of a swell too, and a tenth off the flow's.
+    """
     found = Channel(20, *given, **options).run()
     assert found["slid"] > slid
     assert found["flow"] == pytest.approx(1.0, abs=0.01) and found["slope"] == pytest.approx(1.0, abs=0.01)

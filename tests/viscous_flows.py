@@ -125,6 +125,8 @@ class Channel:
     solver: str = "pcisph"
     time: float = 0.3 / NU
     """[s]"""
+    apart: float = 0.0
+    """By how much of itself the viscosity is changed to both sides for the slope; without, a tangent gives it."""
 
     def series(self) -> tuple[np.ndarray, np.ndarray]:
         """Odd numbers n, and the amplitudes of sin(n pi y) [m/s] of the flow at last, for a push of 1 m/s2."""
@@ -171,11 +173,16 @@ class Channel:
 
         values = {"initial_velocities": v, "viscosity": VISCOSITY}
         end = problem.tangents(values, {"viscosity": DENSITY}, observe, [steps])[steps]
+        slope = dot[:, 0].mean()
+        if self.apart:
+            ends = (problem.end({**values, "viscosity": VISCOSITY * (1.0 + h)}) for h in (self.apart, -self.apart))
+            faster, slower = (end.state.numpy(2)["velocities"][:, 0].mean() for end in ends)
+            slope = (faster - slower) / (2.0 * self.apart * NU)
         mean = self.reynolds * NU
         between = np.diff(self.exact(np.array([0.5, 1.5]) * spacing))[0]
         return {
             "flow": end.velocities[:, 0].mean() / mean,
-            "slope": dot[:, 0].mean() / self.exact_slope(),
+            "slope": slope / self.exact_slope(),
             "across": np.abs(end.velocities[:, 1]).max() / mean,
             "moved": np.abs(end.positions[:, 1] - y).max() / spacing,
             "slid": float(between * self.time / spacing),
