@@ -306,7 +306,7 @@ def test_a_paddle_stirs_and_nothing_enters_it():
 def test_a_cup_is_turned_upside_down_and_back_and_loses_what_it_pours_alone():
     found = cup_turned(30, 900)
     assert found["through its wall"] == 0 and found["deepest"] < 0.5
-    assert found["poured"] > 600 and found["poured"] + found["still in it"] == found["particles"]
+    assert found["poured"] > 0.8 * found["particles"] and found["poured"] + found["still in it"] == found["particles"]
 
 
 @pytest.mark.parametrize("name", ["torus", "cup with a handle", "bodies that overlap"])
