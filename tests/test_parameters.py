@@ -76,7 +76,7 @@ def test_a_rollout_takes_derivatives_of_its_own_alone():
 def test_parameters_are_a_table(given):
     simulation = Simulation(plane())
     loss = losses.FinalPositions(simulation.positions)
-    with pytest.raises(InputError, match=r"parameters are .*, but must be a table by name, such as \{'gravity'"):
+    with pytest.raises(InputError, match=r"parameters are .*, but must be a dictionary, such as \{'gravity'"):
         Problem(simulation, 3, loss).value(given)
     with pytest.raises(InputError, match=r"memory_budget is .* must be a whole number of at least 0"):
         Problem(simulation, 3, loss, memory_budget=given)

@@ -39,8 +39,8 @@ class Ensemble:
     """
 
     spread: float | Mapping[str, float] = 0.5
-    """Width of the ensemble in each parameter, in the unit of the parameter: one number, or a table by name. The width
-    is sqrt((N + 2) / N) times the standard deviation of a component, where N is the number of components."""
+    """Width of the ensemble in each parameter, in the unit of the parameter: one number, or a dictionary by name. The
+    width is sqrt((N + 2) / N) times the standard deviation of a component, where N is the number of components."""
     samples: int = 8
     """Number of samples, at most 100,000. The memory must have room for the results of all samples."""
     position_noise: float = 0.01

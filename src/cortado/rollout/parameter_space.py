@@ -48,7 +48,7 @@ class ParameterSpace:
     def checked(self, values: Values, what: str = "parameter") -> Arrays:
         """Return valid values as float64 arrays. With ``what`` "direction", negative values are valid."""
         if not isinstance(values, Mapping):
-            raise InputError(f"{what}s are {shown(values)}, but must be a table by name, such as {{'gravity': value}}.")
+            raise InputError(f"{what}s are {shown(values)}, but must be a dictionary, such as {{'gravity': value}}.")
         for view, name in self._known.views.items():
             if view in values and name in values:
                 raise InputError(f"{what} {name} is given, but must be left out, as {view} is given in its place.")
