@@ -205,11 +205,11 @@ def test_states_of_others_are_refused_in_a_sentence(batches):
         (lambda: splash.restore(own), f"state is of {carried}, but must be of 1 scene of the task Splash"),
         (lambda: double.restore(own), "but must be of 1 scene of the task Carry, small, in float64"),
         (lambda: FluidEnv(wider()).restore(own), "state is of another scene than that of 1 scene of the task Carry"),
-        (lambda: single.restore({"positions": 0}), "state is a table, but must be a state that an environment has"),
+        (lambda: single.restore({"positions": 0}), "state is a table, but must be an EnvState, as save"),
         (lambda: single.reset(seed=1, options={"state": own}), "seed is given, but must be left out with a state"),
         (lambda: envs.reset(options={"state": state, "reset_mask": np.ones(2, bool)}), "reset_mask is given, but must"),
         (lambda: splash.save(), r"save is called before the first reset\(\), but must come after it"),
-        (lambda: state[[2]], r"numbers are \[2\], but must be one or more from 0 to 1"),
+        (lambda: state[[2]], r"numbers are \[2\], but must be scene numbers from 0 to 1"),
     ]:
         with pytest.raises(InputError, match=words):
             call()

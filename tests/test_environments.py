@@ -255,7 +255,7 @@ def test_steps_before_the_first_episode_and_other_bad_calls(environments):
         (lambda: envs.reset(options={"reset_mask": np.zeros(2, dtype=bool)}), "reset_mask"),
         (lambda: envs.reset(seed=[1, 2, 3]), "seed has 3 numbers"),
         (lambda: envs.step(np.zeros((2, 2))), "must come after reset"),
-        (lambda: env.reset(options={"goal": 0.3}), "options has 'goal', but must have state alone"),
+        (lambda: env.reset(options={"goal": 0.3}), "options has 'goal', but may have state only"),
     ]:
         with pytest.raises(InputError, match=words):
             call()

@@ -218,7 +218,7 @@ def test_what_diverges_is_nan_and_the_others_are_there(problem, request, gradien
     at_rest, far = (np.full_like(problem.simulation.positions, size) for size in (0.0, 1e5))
     points = [{"initial_velocities": velocities} for velocities in (at_rest, far, at_rest, far)]
     told = {}
-    words = r"^2 of 4 points diverged, and their losses are NaN\. The first of them is point 1: The simulation diverged"
+    words = r"^2 of 4 points diverged, and the losses of these points are NaN\. The first failed point is point 1: The "
     with pytest.warns(CortadoWarning, match=words):
         found = cortado.evaluate(problem, points, gradient, executor, on_result=told.__setitem__)
     wanted = [problem.estimate(point, gradient) if gradient else problem.value(point) for point in points[::2]]

@@ -72,7 +72,7 @@ def test_the_schedule_grows_to_one(file):
         with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*the last of them 1"):
             load_task(file, [f"optimise.extinction_schedule={schedule}"])
     file.write_text(GOOD_TASK)
-    with pytest.raises(SceneError, match=r"optimise\.extinction_schedule .*left out, as positions are compared"):
+    with pytest.raises(SceneError, match=r'optimise\.extinction_schedule .*left out, as problem\.loss is not "image"'):
         load_task(file, [STAGED])
 
 

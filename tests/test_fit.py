@@ -331,7 +331,7 @@ def test_points_whose_runs_diverge_are_counted(shaken, monkeypatch):
     monkeypatch.setattr(measured.Experiment, "predicted", lost)
     found = cortado.fit(with_shake(shaken, 0, 1e-5), {"viscosity": 1.5}, starts=8)
     assert found.refused > 0 and f"The runs at {found.refused} points" in str(found)
-    assert "of noise alone" in str(found) and "of noise alone" in found._repr_html_()
+    assert "include noise only" in str(found) and "include noise only" in found._repr_html_()
 
 
 def test_what_cannot_be_told_is_said(simulation, shaken):

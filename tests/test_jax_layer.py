@@ -317,7 +317,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
         (lambda: layer.step(simulation, state, gradient=gentle), "estimator is .*, but must be an AdjointEstimator"),
         (lambda: layer.step(simulation, state, gradient=Changing()), "estimator has an unhashable type: 'Changing'"),
         (lambda: layer.value(problem, gentle)({}, state), "gradient is a RandomizedSmoothing, but must be an Adj"),
-        (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2, but must be"),
+        (lambda: layer.measure(Simulation(plane(), batch=2), "density"), "simulation is a batch of 2 scenes, but must"),
         (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be a renderer, such as"),
     ]:
         assert_refused(words, use)
@@ -326,7 +326,7 @@ def test_other_bad_uses_are_refused_in_a_sentence(jax, layer, simulation, proble
 def test_second_derivatives_are_refused_in_a_sentence(jax, layer, problem):
     loss = layer.value(problem)
     for second in (jax.hessian, lambda f: jax.grad(jax.grad(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
-        with pytest.raises(InputError, match="first ones only"):
+        with pytest.raises(InputError, match="only first derivatives exist"):
             second(lambda m: loss({"viscosity": m}))(jax.numpy.asarray(10.0))
 
 

@@ -137,7 +137,7 @@ def test_bad_loops_are_refused_in_a_sentence(jax, simulation):
         ),
         (
             lambda: layer.smoothed(simulation, lambda w, s, g: s["positions"], gradients.Guided(0.5))({"g": [0.0]}),
-            r"loss returned an array \(.*\), but must return one number",
+            r"loss returned an array of shape \(.*\), but must return one number",
         ),
     ):
         with pytest.raises(InputError, match=sentence):

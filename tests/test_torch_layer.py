@@ -207,8 +207,8 @@ def test_other_bad_uses_are_refused_in_a_sentence(layer, simulation, problem):
         (lambda: layer.picture(simulation, state["positions"]), "renderer is .*, but must be a renderer, such as"),
         (lambda: layer.Steps(problem), "simulation is .*, but must be a cortado.Simulation"),
         (lambda: layer.Steps(simulation, trained={"viscosity": "thick"}), "parameter viscosity is 'thick', but must"),
-        (lambda: second(layer, problem, viscosity), "first ones only: leave out create_graph=True"),
-        (lambda: torch.func.hessian(lambda m: layer.value(problem)({"viscosity": m}))(tensor(1.0)), "first ones only"),
+        (lambda: second(layer, problem, viscosity), "first derivatives exist: leave out create_graph=True"),
+        (lambda: torch.func.hessian(lambda m: layer.value(problem)({"viscosity": m}))(tensor(1.0)), "only first"),
         (lambda: torch.func.jvp(picture, (first,), (first,)), "reverse mode only"),
     ]:
         assert_refused(words, use)

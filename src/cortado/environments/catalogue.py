@@ -46,7 +46,7 @@ class Vessels(Task):
         return [*lower, -half][: self.dimension], [*upper, half][: self.dimension]
 
     def filled(self, lower: Sequence[float], upper: Sequence[float], phase: str) -> dict[str, Any]:
-        """Return the scene table of a fluid, which fills a box in 2-D and a cylinder in 3-D. Corners are in m."""
+        """Return the scene table of a fluid. The fluid fills a box in 2-D and a cylinder in 3-D. Corners are in m."""
         if self.dimension == 2:
             return box(lower, upper, phase=phase)
         size = {"radius": 0.5 * (upper[0] - lower[0]), "height": upper[1] - lower[1]}
@@ -94,7 +94,7 @@ class Carry(Vessels):
 
 
 class CarryInSpace(Carry):
-    """The task of carrying a lower, round cup of water, which leans about an axis across its path."""
+    """The 3-D task of carrying a round cup of water. The cup is lower than in `Carry`, and turns about z."""
 
     name = "CarryInSpace"
     dimension, finer = 3, 2
@@ -104,8 +104,8 @@ class CarryInSpace(Carry):
 
 
 class Latte(Task):
-    """The task of pouring milk into coffee like a nozzle on a hidden path, after LatteArt of FluidLab (Xian et al.
-    2023). The goals of milk particles are their positions in a run along the hidden path."""
+    """The task of pouring milk into coffee in the same pattern as a nozzle on a hidden path, after LatteArt of FluidLab
+    (Xian et al. 2023). The goal of each milk particle is its position in a run along the hidden path."""
 
     name = "Latte"
     horizon, repeats, lowest = 32, 6, -4.0
@@ -138,7 +138,7 @@ class Latte(Task):
 
 
 def hidden_actions(task: Latte) -> NDArray:
-    """Return actions (horizon, 1) that lead the nozzle once around a heart, and then to its middle."""
+    """Return actions (horizon, 1) that lead the nozzle once around a heart, and then to x = 0."""
     angle = 2.0 * np.pi * np.arange(task.horizon) / task.pouring
     return np.where(angle < 2.0 * np.pi, np.sin(angle) ** 3, 0.0)[:, None]
 
@@ -291,7 +291,7 @@ class Stir(Task):
     width, depth, milky = 0.08, 0.045, 0.02
     """Width of the cup, depth of the fluid, and size of the region with milk in the left half of the cup [m]."""
     spoon, radius, reach, lag = (0.04, 0.0225), 0.01, (0.018, 0.005), 0.1
-    """Initial position of the spoon [m], radius [m], greatest displacement [m], and time constant of the motion [s]."""
+    """Initial position, radius and greatest displacement of the spoon [m], and time constant of its motion [s]."""
     actuators = (Position("spoon.displacement", (0.0, 0.0), (0, 1), reach, lag=lag),)
 
     @property

@@ -91,7 +91,7 @@ class Twin:
         shape = getattr(actions, "shape", None)
         if shape is None or tuple(shape) != self.shape:
             found = f"is {shown(actions)}" if shape is None else f"has shape {tuple(shape)}"
-            raise InputError(f"actions {found}, but must be an array {self.shape}.")
+            raise InputError(f"actions {found}, but must be an array of shape {self.shape}.")
         u, parameters, first = actions.clip(-1.0, 1.0), dict[str, Any](self._start), 0
         for one in self._actuators:
             last, affine = first + len(one.axes), self.coordinates[one.parameter]
@@ -169,8 +169,8 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         """Advance the episode by one action, which is clipped to the range from -1 to 1.
 
         An episode is truncated after the task's number of steps, or after ``max_episode_steps`` of `gymnasium.make`. If
-        the simulation diverges, the episode is terminated, ``info["diverged"]`` describes the problem, and the
-        observation is the previous one.
+        the simulation diverges, the episode is terminated, ``info["diverged"]`` describes the problem, and the step
+        returns the previous observation.
 
         Raises `InputError` if the action has a wrong shape or is not finite, or if no episode is in progress.
         """
@@ -264,7 +264,7 @@ class FluidVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Begin all episodes, or only the episodes in a bool array (num_envs,), given as ``options={"reset_mask":
+        """Begin all episodes, or only the episodes that a bool array (num_envs,) selects: ``options={"reset_mask":
         mask}``. If ``seed`` is a number, environment b gets the seed ``seed + b``. With ``options={"state": state}``
         the environments return to a saved state."""
         self._require_open("reset")
@@ -292,9 +292,9 @@ class FluidVectorEnv(VectorEnv):
     def step(self, actions: NDArray) -> tuple[Observation, NDArray, NDArray, NDArray, Info]:
         """Advance all episodes by actions (num_envs, a), like `FluidEnv.step`.
 
-        The autoreset mode decides when a new episode begins. In NEXT_STEP mode the next step ignores the action and
-        begins the episode. In SAME_STEP mode the episode begins at once, and the last observation and info are in
-        ``infos["final_obs"]`` and ``infos["final_info"]``. In DISABLED mode only `reset` begins an episode.
+        The autoreset mode decides when a new episode begins. In NEXT_STEP mode, the step after an ended episode ignores
+        the action and begins a new episode. In SAME_STEP mode the episode begins at once, and the last observation and
+        info are in ``infos["final_obs"]`` and ``infos["final_info"]``. In DISABLED mode only `reset` begins an episode.
         """
         self._require_open("step")
         actions = checked_actions("actions", actions, self._shape)
@@ -366,10 +366,10 @@ def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
     found, known = options or {}, ("state", *others)
     for name in found:
         if name not in known:
-            raise InputError(f"options has {shown(name)}, but must have {' or '.join(known)} alone.")
+            raise InputError(f"options has {shown(name)}, but may have {' or '.join(known)} only.")
     if "state" in found and (seed is not None or len(found) > 1):
         other = "seed" if seed is not None else others[0]
-        raise InputError(f"{other} is given, but must be left out with a state, which has its random numbers.")
+        raise InputError(f"{other} is given, but must be left out with a state.")
     return found.get("state")
 
 

@@ -32,10 +32,10 @@ from cortado.simulation import Simulation
 
 JITTER = 0.02
 LANES = 1
-"""Number of threads per particle. The number is fixed, so that results are bitwise equal for all batch sizes."""
+"""Number of threads per particle. A fixed number makes results bitwise equal for all batch sizes."""
 SEEN = 32
 MOST_PARTS = 16
-"""Greatest number of parts of a batch. A larger batch uses all cores without a split, but without graphs."""
+"""Greatest number of parts of a batch. A larger batch is not split. It uses all cores, but no graphs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +77,10 @@ class EnvState:
     @WARP
     def __getitem__(self, numbers: int | Iterable[int]) -> "EnvState":
         """Return the state of a batch that consists of the chosen scenes. Numbers may repeat: ``state[[0] * 8]`` is a
-        batch of eight scenes in the state of scene 0, with equal random generators."""
+        batch of eight copies of scene 0, with equal random generators."""
         chosen = list(numbers) if isinstance(numbers, Iterable) else [numbers]
         if not chosen or any(not isinstance(b, (int, np.integer)) or not 0 <= b < len(self) for b in chosen):
-            raise InputError(f"numbers are {shown(numbers)}, but must be one or more from 0 to {len(self) - 1}.")
+            raise InputError(f"numbers are {shown(numbers)}, but must be scene numbers from 0 to {len(self) - 1}.")
         arrays: Any = {name: getattr(self, name)[chosen] for name in ("step_number", "over", "observations")}
         for name in ("clocks", "starts", "generators"):
             arrays[name] = tuple(getattr(self, name)[b] for b in chosen)
@@ -129,8 +129,8 @@ def parts_of(simulation: Simulation) -> int:
 
 
 class SideBySide:
-    """A stepper that splits a batch into parts, because only small launches on a CPU are captured as graphs. The split
-    does not change any bit of the results."""
+    """A stepper that splits a batch into parts, because only small launches on a CPU are captured as graphs. Results
+    with and without the split are bitwise equal."""
 
     def __init__(self, simulation: Simulation, make: Callable[[int], Simulation], parts: int, steps: int):
         scenes = simulation.batch or 1
@@ -238,9 +238,8 @@ class Scenes:
 
     @WARP
     def taken(self, saved: EnvState) -> DeviceState:
-        """Copy a saved state to the device."""
         if not isinstance(saved, EnvState):
-            raise InputError(f"state is {shown(saved)}, but must be a state that an environment has saved.")
+            raise InputError(f"state is {shown(saved)}, but must be an EnvState, as save returns.")
         own = self.simulation.scene
         if saved.kind != self.kind or (saved.scene is not own and saved.scene != own):
             other = saved.kind if saved.kind != self.kind else f"another scene than that of {self.kind}"

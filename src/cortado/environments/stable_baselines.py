@@ -46,8 +46,8 @@ class OneOfBatch:
 class StableBaselinesVecEnv(VecEnv):
     """A batch of environments of one task as a `VecEnv` of Stable-Baselines3. `docs/environments.md` describes it.
 
-    When an episode ends, a new episode begins in the same step. ``infos[b]["terminal_observation"]`` is then the last
-    observation of the ended episode of environment b. ``infos[b]["TimeLimit.truncated"]`` is True unless the episode
+    When the episode of environment b ends, a new episode begins in the same step. The last observation of the ended
+    episode is in ``infos[b]["terminal_observation"]``. ``infos[b]["TimeLimit.truncated"]`` is True unless the episode
     diverged.
     """
 

@@ -18,8 +18,8 @@ from cortado.simulation import Simulation
 
 @dataclass(frozen=True)
 class Actuator(ABC):
-    """An actuator converts actions from -1 to 1 to components of a parameter. The command is the action times
-    ``greatest``. During an environment step the command changes linearly from its last value."""
+    """An actuator converts actions from -1 to 1 to the driven components of a parameter. The command is the action
+    times ``greatest``. During an environment step the command changes linearly from its last value."""
 
     parameter: str
     """Name of the driven parameter, such as "cup.displacement"."""
@@ -34,7 +34,7 @@ class Actuator(ABC):
 
     @abstractmethod
     def after(self, q: NDArray, command: NDArray, time_step: float) -> NDArray:
-        """Return the driven components (..., a) after one simulation step from the components ``q``."""
+        """Return the driven components (..., a) after a simulation step that begins with the components ``q``."""
 
     def at_rest(self, members: int) -> NDArray:
         """Return the driven components and the commands before any action (members, 2, a)."""
@@ -57,7 +57,7 @@ class Actuator(ABC):
 
     def over(self, actions: int, steps: int, time_step: float, begun: NDArray | None = None) -> Affine:
         """Return the parameter as an affine function of actions (actions, a). Each action lasts ``steps`` simulation
-        steps. ``begun`` has the initial components and commands (1, 2, a), by default at rest."""
+        steps. ``begun`` has the initial components and commands (1, 2, a). By default the actuator begins at rest."""
         a = len(self.axes)
         units = np.concatenate([np.zeros((1, actions, a)), np.eye(actions * a).reshape(-1, actions, a)])
         now, parts = np.repeat(self.at_rest(1) if begun is None else begun, len(units), axis=0), []
@@ -78,7 +78,7 @@ class Velocity(Actuator):
 
 @dataclass(frozen=True)
 class Position(Actuator):
-    """An actuator whose command is the target of the driven component."""
+    """An actuator whose command is the target value of the driven component."""
 
     lag: float = 0.1
     """Time constant of the approach to the target [s]."""
@@ -106,7 +106,7 @@ class Task(ABC):
     coarse_step: ClassVar[float]
     """Time step of the small size [s]."""
     lowest: ClassVar[float]
-    """Least reward of a step. A diverged episode gets this reward for every missing step."""
+    """Least reward of a step. After a diverged episode, each missing step counts with this reward."""
     free_solids: ClassVar[tuple[str, ...]] = ()
     """Names of the rigid bodies that are observed."""
     goal_names: ClassVar[tuple[str, ...]] = ()
@@ -153,7 +153,7 @@ class Task(ABC):
 
     @abstractmethod
     def reward(self, simulation: Simulation) -> Reward:
-        """Return the reward function of an environment step, given a simulation of the scene."""
+        """Return the reward function of an environment step. ``simulation`` simulates the scene of the task."""
 
     @property
     def goals(self) -> tuple[NDArray, NDArray]:

@@ -47,7 +47,7 @@ class StepEnd:
 
 
 class Term(Protocol):
-    """Protocol of a reward term. It returns a number for each scene, and the derivative of this number."""
+    """Protocol of a reward term. A term computes a number for each scene, and the derivative of the number."""
 
     def values(self, at: StepEnd) -> NDArray:
         """Return the value of the term for each scene (scenes,)."""
@@ -119,13 +119,13 @@ class OverParticles:
 
 
 class Share(OverParticles):
-    """A reward term: the fraction of the fluid in boxes, as the mean of 1 / (1 + e^2 / w^2) over particles. The
-    distance from the nearest box is e, and the ``width`` is w."""
+    """A reward term: the fraction of the fluid in boxes. The fraction is the mean of 1 / (1 + e^2 / w^2) over
+    particles, with the distance e from the nearest box and the ``width`` w."""
 
     kernel = "share"
 
     def __init__(self, boxes: Boxes, width: float, solid: str | None = None):
-        """``width`` [m] is the width of the transition. Boxes move with a ``solid``, which turns only about z."""
+        """``width`` [m] is the width of the transition. The boxes move with ``solid``, which turns only about z."""
         super().__init__(boxes, width, solid)
         self._boxes, self._width, self._solid = boxes, width, solid
 
@@ -161,7 +161,7 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` of pairs of chosen particles, divided by the length
+    """A reward term: the mean distance ``|dx| + |dy|`` of pairs of chosen particles, divided by the constant
     ``everywhere``. Distances are between nearest periodic images."""
 
     kernel = "apart"
@@ -184,7 +184,7 @@ class Spread(OverParticles):
 
 
 class Missed(OverParticles):
-    """A reward term: the weighted sum of squared distances of particles from their targets in a step."""
+    """A reward term: the weighted sum of squared distances of particles from the targets of the current step."""
 
     kernel = "missed"
 
@@ -202,7 +202,7 @@ class Missed(OverParticles):
 
 @dataclass(frozen=True)
 class Miss:
-    """A reward term: the absolute difference between a term's value and the first component of the goal."""
+    """A reward term: the absolute difference between the value of another term and the first component of the goal."""
 
     term: Term
 
@@ -228,8 +228,8 @@ class Distance:
 
 @dataclass(frozen=True)
 class Pose:
-    """A reward term of a free body in the plane: (x - x*)^2 / l^2 + 2 (1 - cos angle), with the body's position x along
-    the first axis, the goal x*, the length l and the body's angle."""
+    """A reward term of a free body in the plane. The value is (x - x*)^2 / l^2 + 2 (1 - cos angle), with the position x
+    and the goal x* along the first axis, the length l, and the angle of the body."""
 
     solid: str
     length: float

@@ -1,6 +1,6 @@
 """Data sets of varied runs for learned simulators: the table [dataset], random values, arrays and files.
 
-At first each run has its own file. Three files with metadata contain all runs at the end.
+Each run is first written to a separate file. At the end, three files contain all runs, and a fourth the metadata.
 """
 
 import io
@@ -37,17 +37,17 @@ PAIR = "a lower and an upper end of the same shape, each a number or a list of n
 
 def _ranges(given: Any) -> Any:
     if not isinstance(given, Mapping):
-        raise field_error((), given, "a table of ranges by the keys of values")
+        raise field_error((), given, "a table with a range of values for each key")
     found = {}
     for key, pair in given.items():
         if isinstance(pair, Mapping):
-            raise field_error((key,), pair, f'{PAIR}; a key with dots stands in quotes, as in vary."{key}.…"')
+            raise field_error((key,), pair, f'{PAIR}; put a key with dots in quotes, as in vary."{key}.…"')
         try:
             lower, upper = np.asarray(pair, dtype=np.float64)
         except (ValueError, TypeError):
             raise field_error((key,), pair, PAIR) from None
         if not np.isfinite([lower, upper]).all() or np.any(lower > upper):
-            raise field_error((key,), pair, f"{PAIR}, finite, the lower one nowhere above the upper one")
+            raise field_error((key,), pair, f"{PAIR}, finite, and no lower end above its upper end")
         found[key] = (lower.tolist(), upper.tolist())
     return found
 
@@ -65,9 +65,9 @@ class DatasetTable(Table):
     steps: Annotated[int, count(1, 10_000_000)]
     """Number of time steps of each run."""
     write_every: Annotated[int, count(1, 10_000_000)] = 1
-    """Number of time steps from one frame to the next; steps must be a multiple of this number."""
+    """Number of time steps between two frames. The number `steps` must be a multiple of `write_every`."""
     vary: Ranges = Field(default_factory=dict)
-    """Ranges of values, by the key of a scene in quotes, as in vary."phase.0.viscosity" = [0.1, 1.0]. For each run,
+    """Range of values for each varied key of the scene, as in vary."phase.0.viscosity" = [0.1, 1.0]. For each run,
     every component of a value is drawn independently."""
     logarithmic: tuple[Text, ...] = ()
     """Keys of vary whose values have a log-uniform distribution."""
@@ -76,9 +76,9 @@ class DatasetTable(Table):
     velocity_noise: Annotated[float, quantity("m/s", ge=0.0)] = 0.0
     """Standard deviation of the noise in every component of the initial velocities [m/s]"""
     valid: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """Fraction of the runs for validation; a fraction above 0 means at least one run."""
+    """Fraction of the runs that are validation data. A fraction above 0 gives at least one run."""
     test: Annotated[float, quantity(ge=0.0, le=0.9)] = 0.1
-    """Fraction of the runs for tests; a fraction above 0 means at least one run."""
+    """Fraction of the runs that are test data. A fraction above 0 gives at least one run."""
     walls: Flag = True
     """Append wall particles to the fluid particles."""
     tangents: Annotated[int, count(0, 1_000)] = 0
@@ -93,20 +93,20 @@ class DatasetTable(Table):
         if self.steps % self.write_every:
             raise field_error(("write_every",), self.write_every, f"a divisor of steps, which is {self.steps}")
         if self.valid + self.test >= 1.0:
-            raise field_error(("test",), self.test, f"less than {1.0 - self.valid:g}, so that runs to train are left")
+            raise field_error(("test",), self.test, f"less than {1.0 - self.valid:g}, to leave runs for training")
         if not self.vary and not self.position_noise and not self.velocity_noise:
-            raise field_error(("vary",), "nothing", "given, or position_noise or velocity_noise, so that runs differ")
+            raise field_error(("vary",), "nothing", "given, unless position_noise or velocity_noise is set")
         if not self.tangents and self.tangent_frames != "last":
-            raise field_error(("tangent_frames",), self.tangent_frames, "left out, as there are no tangents")
+            raise field_error(("tangent_frames",), self.tangent_frames, "left out, as dataset.tangents is 0")
         for key in self.logarithmic:
             if key not in self.vary:
-                raise field_error(("logarithmic",), key, "one of the keys of vary")
+                raise field_error(("logarithmic",), key, "one of the keys in dataset.vary")
             if np.min(self.vary[key][0]) <= 0.0:
-                raise field_error(("vary", key), self.vary[key][0], "above 0, as its logarithm is drawn")
+                raise field_error(("vary", key), self.vary[key][0], "above 0, as the key is in dataset.logarithmic")
         return self
 
     def split(self, runs: int) -> dict[str, list[int]]:
-        """Return the numbers of the runs for each purpose. Additional runs do not change the use of earlier runs."""
+        """Return run numbers by purpose. Additional runs do not change the purpose of earlier runs."""
         parts = {"train": 1.0 - self.valid - self.test, "valid": self.valid, "test": self.test}
         found: dict[str, list[int]] = {purpose: [] for purpose in parts}
         for number in range(runs):
@@ -164,7 +164,7 @@ class Sample:
 
 FIRST = ("initial_positions", "initial_velocities")
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
-"""Particle types of LagrangeBench. ``MORE_FLUID`` is for further phases, ``KINDS`` is the number of types."""
+"""Particle types of LagrangeBench. ``MORE_FLUID`` is the type of the second phase. ``KINDS`` is the number of types."""
 MARGIN = 3
 """Distance from the container to the bounds of the data set [spacings]. LagrangeBench treats all axes as periodic if
 one axis is periodic. Opposite walls must therefore be far apart."""
@@ -235,7 +235,7 @@ def _statistics(positions: np.ndarray, places: np.ndarray, periods: np.ndarray) 
     if places.min() < 0.0:
         frame, particle, axis = np.unravel_index(places.argmin(), places.shape)
         found = f"Particle {particle} is {-places.min():.3g} m below the bounds of the data set along axis {axis}"
-        within = f"must be within: they begin {MARGIN} spacings outside of the container"
+        within = f"must be within the bounds, which begin {MARGIN} spacings outside of the container"
         raise InputError(f"{found} in frame {frame}, but {within}.")
     moved = np.diff(positions, axis=0)
     moved -= periods * np.round(moved / np.where(periods > 0.0, periods, 1.0))  # to the nearest periodic image
@@ -274,7 +274,7 @@ METADATA, PARTS, PURPOSES = "metadata.json", "runs", ("train", "valid", "test")
 REACH = 1.6
 """Radius within which a learned simulator connects particles [spacings]."""
 SPARE = 1.02
-"""Free disk space needed to assemble the runs, relative to the size of the runs."""
+"""Free disk space for joining the runs in the final files, relative to the size of the runs."""
 
 
 @dataclass(frozen=True)
@@ -367,9 +367,9 @@ class DatasetFolder:
         with sentences(self.out):
             needed = SPARE * sum(path.stat().st_size for path in sources)
             if (free := shutil.disk_usage(self.out).free) < needed:
-                found = f"{self.out} needs {needed / 1e9:.3g} GB to put its runs together"
+                found = f"{self.out} needs {needed / 1e9:.3g} GB to join its runs"
                 left = f"the disk has {free / 1e9:.3g} GB left"
-                raise ComputationError(f"{found}, but {left}; free some space, and give the same command again.")
+                raise ComputationError(f"{found}, but {left}; free some space, and repeat the command.")
             try:
                 for (path, temporary), numbers in zip(temporaries.items(), stale.values(), strict=True):
                     self._copy([self.runs[number] for number in numbers], path, temporary)
@@ -391,7 +391,7 @@ class DatasetFolder:
                 os.fsync(file.fileno())
         except RuntimeError as problem:  # so HDF5 says that the disk refused
             said = f"{path} cannot be written, as the disk refuses"
-            raise ComputationError(f"{said}; free some space, and give the same command again.") from problem
+            raise ComputationError(f"{said}; free some space, and repeat the command.") from problem
 
     def write_metadata(self, content: Mapping[str, Any]) -> None:
         write_atomically(self.out / METADATA, json.dumps(content, indent=2) + "\n")

@@ -27,18 +27,18 @@ GREATEST_GRADIENT = 1e150
 REFUSED = (DivergedError, InputError)
 """Errors that give a trial point an infinite loss."""
 WRONG = 10.0
-"""A gradient counts as wrong if predicted and real changes of the loss differ by more than this factor."""
+"""A gradient counts as wrong if predicted and real changes of the loss differ by more than a factor of `WRONG`."""
 FELT = 0.01
 """Changes of the loss below this fraction of the range of all losses are negligible."""
 ROUND_OFF = 1e-5
 """Round-off of a float32 loss, relative to the greatest loss. Smaller predicted changes are not tested."""
 MISLED, FEW = 0.25, 2
-"""A search counts as misled from this fraction and this number of steps with wrong gradients."""
+"""Least fraction and least number of steps with wrong gradients in a search that counts as misled."""
 LEAST = 8
 
 
 class Optimisable(Protocol):
-    """Protocol of problems for `optimise`. The optional text `fingerprint` is compared when a search is resumed."""
+    """Protocol of problems for `optimise`. A resumed search compares the optional text `fingerprint`."""
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
         """Return the loss, and its gradient as arrays by parameter name in the shapes of the parameters."""
@@ -59,7 +59,7 @@ class Record:
     replayed: bool
     """True if the evaluation comes from the checkpoint."""
     refused: int = 0
-    """Number of refused steps before this evaluation, as in `Result.refused`."""
+    """Number of steps that the search refused before the evaluation, as in `Result.refused`."""
     left_out: int = 0
     """Number of failed runs that ensemble averages ignored so far. Replayed evaluations are not counted."""
 
@@ -71,8 +71,9 @@ class Record:
 class Promises:
     """Predicted and real changes of the loss in each step of a search, to test the gradients.
 
-    The slopes at the two ends of a step give two predictions. The change of a smooth loss is close to a prediction or
-    between the two. A step may cross a minimum if the slope changes its sign. Such a step is not tested.
+    The slopes at both ends of a step give two predictions of the change of the loss. The change of a smooth loss is
+    close to one prediction, or between both. If the slope changes its sign, the step may cross a minimum and is not
+    tested.
     """
 
     losses: list[float] = field(default_factory=list)
@@ -95,7 +96,7 @@ class Promises:
     def doubt(
         self, search: Search, estimator: object, optimiser: object, converged: bool, is_run: bool
     ) -> tuple[bool, bool, str]:
-        """Return whether the gradients misled the search, whether its loss stopped falling, and advice."""
+        """Return True if gradients misled the search, True if the loss stays large, and advice as text."""
         assert self._best is not None
         x, gradient = self._best.parameters, self._best.gradient
         outwards = ((x <= search.lower) & (gradient > 0.0)) | ((x >= search.upper) & (gradient < 0.0))
@@ -114,23 +115,23 @@ class Promises:
         stopped = converged or (len(self.losses) >= LEAST and before - best < FELT * abs(best))
         stays, to_try = not names and best > FELT * self.losses[0] and stopped, ["another start"]
         if misled:
-            said = f" The gradient disagrees with what steps did: in {broken} of {told} that tell, the loss changed by"
-            said += " less than a tenth of what it promised, or by more than ten times as much."
+            said = f" The gradient is wrong: in {broken} of {told} tested steps, the loss changed by less than a tenth"
+            said += " or by more than ten times of the change that the gradient predicted."
             if is_run and is_exact:
-                said += " certify says up to which step of the run it is of use; beyond that, search with the gradient"
-                return misled, stays, f"{said} AdjointViscosity() and the optimiser LineSearch, or elsewhere."
-            to_try += [] if is_run else ["differences, to check it"]
+                said += " cortado.certify finds how many steps have useful gradients. For more steps, use the gradient"
+                return misled, stays, f"{said} AdjointViscosity() with the optimiser LineSearch, or another start."
+            to_try += [] if is_run else ["finite differences, to check the gradient"]
         elif stays:
-            said = f" The loss has stayed at {best / self.losses[0]:.0%} of the first one, maybe in a wrong valley."
+            said = f" The lowest loss is {best / self.losses[0]:.0%} of the first loss, maybe in a wrong local minimum."
             to_try += ["fewer steps"] if is_run else []
             if is_run and is_exact:
                 pair = "the gradient AdjointViscosity() with the optimiser LineSearch"
-                said += f" Try {', or '.join(to_try)}; or {pair}, where certify says that the exact one is of no use."
+                said += f" Try {', or '.join(to_try)}; or {pair}, if cortado.certify finds the exact gradient useless."
                 return misled, stays, said
         else:
-            held = f" {ends}, beyond which the loss falls further: widen them, if that makes sense."
+            held = f" {ends}, and the loss falls further beyond: widen the bounds, if wider bounds make sense."
             return misled, stays, held if names else ""
-        to_try += [] if by_direction else ["the optimiser LineSearch, which steps over dents"]
+        to_try += [] if by_direction else ["the optimiser LineSearch, which steps over narrow minima"]
         return misled, stays, f"{said} Try {', or '.join(to_try)}."
 
 
@@ -166,8 +167,8 @@ class Evaluator:
     def __call__(self, vector: Vector) -> tuple[float, Vector]:
         found = self.attempt(vector, is_trial=False)
         if found is None:
-            said = f"Of the former run's evaluations, which {self.log.fate}, one has an infinite loss"
-            raise InputError(f"{said}, but must have a finite one for this optimiser: give another checkpoint folder.")
+            said = f"One of the earlier evaluations, which {self.log.fate}, has an infinite loss"
+            raise InputError(f"{said}, but this optimiser needs finite losses: give another checkpoint folder.")
         return found
 
     def attempt(self, vector: Vector, is_trial: bool = True) -> tuple[float, Vector] | None:
@@ -233,30 +234,30 @@ class Evaluator:
                 return found[0], found[1]
             words = f"a loss and a gradient of type {type(found[1]).__name__}" if pair else f"a {kind} of {len(found)}"
             found = Words(words)
-        said = f"What is optimised returned {shown(found)}, but must return two things: the loss, a number"
-        raise InputError(f"{said}, and its gradient, a dictionary with an array for each parameter by its name.")
+        said = f"problem returned {shown(found)}, but must return two things: the loss, a number"
+        raise InputError(f"{said}, and the gradient, a dictionary with an array for each parameter.")
 
     def _replay(self, vector: Vector, ahead: int = 0) -> LoggedEvaluation:
-        """Return the logged evaluation ``ahead`` positions after the next one."""
+        """Return evaluation ``self.logged + ahead`` of the log. The logged parameters must equal ``vector``."""
         evaluation = self.log.read(self.logged + ahead)
         changed = vector.view(np.uint64) != evaluation.parameters.view(np.uint64)
         if changed.any():
-            found = f"This run asks for evaluation {len(self.history)} at another {self._names_of(changed)}"
-            why = "its start, bounds, optimiser, machine or number of threads differ"
-            advice = f"give the former ones, or another checkpoint folder. The former run's evaluations {self.log.fate}"
-            raise InputError(f"{found} than the run being resumed, so that {why}; {advice}.")
+            found = f"Evaluation {len(self.history)} has another {self._names_of(changed)} now than in the checkpoint"
+            why = "the start, bounds, optimiser, machine or number of threads has changed"
+            advice = f"repeat the old settings, or give another checkpoint folder. The old evaluations {self.log.fate}"
+            raise InputError(f"{found}, because {why}; {advice}.")
         return evaluation
 
     def _with_advice(self, error: DivergedError | InputError, vector: Vector) -> ComputationError:
         if isinstance(error, InputError):
             said = f"In evaluation {len(self.history)} the search tried impossible parameters: {error}"
-            advice = f"bounds on the parameters. The {len(self.history)} evaluations before {self.log.fate}"
+            advice = f"bounds on the parameters. The {len(self.history)} earlier evaluations {self.log.fate}"
             return ComputationError(f"{said} Try a smaller learning rate, or {advice}.")
         best = min(self.history, key=lambda record: record.loss)
         told = [f"{error.advice}, a smaller learning rate or scale, or bounds on the parameters"]
-        least = f"the least loss before is {best.loss:.4g}"
+        least = f"the lowest earlier loss is {best.loss:.4g}"
         if vector.size <= 6:  # else the sentence is too long
-            told.append(f"the search had come to {_in_words(self.layout.unravel(vector))}")
+            told.append(f"the search had reached {_in_words(self.layout.unravel(vector))}")
             least = f"{least} at {_in_words(best.parameters)}"
         return error.with_advice("; ".join([*told, least]))
 
@@ -267,7 +268,7 @@ class Evaluator:
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
             said = f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}"
-            raise InputError(f"{said}; a gradient has the names and the shapes of the parameters.")
+            raise InputError(f"{said}; a gradient must have the names and the shapes of the parameters.")
         gradient = self.layout.ravel({n: as_numbers(f"The gradient of '{n}'", gradients[n]) for n in wanted})
         broken = ~(np.abs(gradient) <= GREATEST_GRADIENT)
         if math.isfinite(loss) and not broken.any():
@@ -277,9 +278,9 @@ class Evaluator:
             what = f"the loss is {loss} as a function of {self._names_of(np.ones_like(broken))}"
         if not self.history:
             said = f"At the start {what}"
-            raise ComputationError(f"{said}; begin elsewhere, look at the loss, or take a shorter horizon.")
-        advice = "try a smaller learning rate, bounds on the parameters, or a shorter horizon"
-        kept = f"The {len(self.history)} evaluations before {self.log.fate}"
+            raise ComputationError(f"{said}; try another start, check the loss function, or take fewer time steps.")
+        advice = "try a smaller learning rate, bounds on the parameters, or fewer time steps"
+        kept = f"The {len(self.history)} earlier evaluations {self.log.fate}"
         raise ComputationError(f"In evaluation {len(self.history)} {what}; {advice}. {kept}.")
 
     def _names_of(self, components: np.ndarray) -> str:

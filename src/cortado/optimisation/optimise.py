@@ -37,19 +37,19 @@ class Function:
 
     def value_and_gradient(self, parameters: dict[str, Any], gradient: Any = None) -> tuple[float, Mapping[str, Any]]:
         if gradient is not None:
-            raise InputError("gradient is given, but must be left out, as a function returns its gradient.")
+            raise InputError("gradient is given, but must be left out, as the function returns its gradient.")
         return self.function(parameters)
 
 
 def as_differentiable(problem: Any) -> Optimisable:
     if isinstance(problem, type):
-        raise InputError(f"What is optimised is the class {problem.__name__}, but must be an object of this class.")
+        raise InputError(f"problem is the class {problem.__name__}, but must be an instance of the class.")
     if hasattr(problem, "value_and_gradient"):
         return problem
     if callable(problem):
         return Function(problem)
-    said = f"What is optimised is {shown(problem)}, but must be a cortado.Problem, an object with value_and_gradient"
-    raise InputError(f"{said}, or a function of the parameters that returns its loss and its gradient.")
+    said = f"problem is {shown(problem)}, but must be a cortado.Problem, an object with value_and_gradient"
+    raise InputError(f"{said}, or a function that maps parameters to the loss and its gradient.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +101,9 @@ class Result:
 
 def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
     if not isinstance(start, Mapping):
-        raise InputError(f"The start is {shown(start)}, but must name its parameters, as {{'gravity': value}} does.")
+        raise InputError(f"The start is {shown(start)}, but must be a dictionary, such as {{'gravity': value}}.")
     if not start:
-        raise InputError("The start names no parameter to optimise; give one or more, as {'gravity': value}.")
+        raise InputError("The start is empty, but must have one parameter or more, such as {'gravity': value}.")
     found = {name: arrays.as_numbers(f"The start of '{name}'", value).copy() for name, value in start.items()}
     for name, array in found.items():
         if array.size == 0:
@@ -116,10 +116,10 @@ def checked_start(start: Mapping[str, Any]) -> dict[str, Vector]:
 def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[str, Vector], dict[str, Vector]]:
     """Return lower and upper bounds by name, in the shapes of the parameters. Missing bounds are infinite."""
     if not isinstance(bounds, Mapping):
-        raise InputError(f"bounds is {shown(bounds)}, but must be a table, such as {{'gravity': (lower, upper)}}.")
+        raise InputError(f"bounds is {shown(bounds)}, but must be a dictionary of pairs (lower, upper).")
     if unknown := sorted(set(bounds) - set(start), key=str):
-        said = f"Bounds are given for {', '.join(map(repr, unknown))}, which the start does not name"
-        raise InputError(f"{said}; the optimised parameters are {', '.join(map(repr, start))}.")
+        said = f"Bounds are given for {', '.join(map(repr, unknown))}"
+        raise InputError(f"{said}, but the start has only the parameters {', '.join(map(repr, start))}.")
     least, most = dict[str, Vector](), dict[str, Vector]()
     for name, value in start.items():
         pair = bounds.get(name, (None, None))
@@ -129,15 +129,15 @@ def checked_bounds(bounds: Bounds, start: Mapping[str, Vector]) -> tuple[dict[st
             high = arrays.as_numbers(f"The upper bound of '{name}'", np.inf if upper is None else upper)
             low, high = np.broadcast_to(low, value.shape), np.broadcast_to(high, value.shape)
         except (TypeError, ValueError):
-            said = f"The bounds of '{name}' must be (lower, upper), each None"
-            raise InputError(f"{said}, a number or an array of shape {value.shape}, not {pair!r}.") from None
+            said = f"The bounds of '{name}' are {pair!r}, but must be a pair (lower, upper)"
+            raise InputError(f"{said} of numbers, arrays of shape {value.shape}, or None.") from None
         if not (low <= high).all():
-            raise InputError(f"The lower bound of '{name}' must not exceed the upper one; neither may be NaN.")
+            raise InputError(f"The lower bound of '{name}' must not exceed the upper bound, and no bound may be NaN.")
         least[name], most[name] = low, high
     for name, value in start.items():
         outside = (value < least[name]) | (value > most[name])
         if outside.any():
-            said = f"{int(outside.sum())} of {outside.size} components; start within the bounds, or widen them"
+            said = f"{int(outside.sum())} of {outside.size} components: change the start, or widen the bounds"
             raise InputError(f"The start of '{name}' is outside of its bounds in {said}.")
     return least, most
 
@@ -151,7 +151,7 @@ def evaluate(
     loss_if_diverged: float | None = None,
     on_result: OnResult | None = None,
 ) -> list[Estimate]:
-    """Return the losses of a problem at many points, in order. The results do not depend on the executor.
+    """Return the losses of a problem, in the order of ``points``. The results do not depend on the executor.
 
     Args:
         problem: a `Problem`, or a `cortado.optimisation.transforms.Transformed` problem.
@@ -190,7 +190,7 @@ def evaluate(
         if len(lost) == len(found):
             raise error
         said = without_runs([*lost.values()], counted(len(found), "point"))
-        warn(f"{said}, and their losses are NaN. The first of them is point {first}: {error}")
+        warn(f"{said}, and the losses of these points are NaN. The first failed point is point {first}: {error}")
     return found
 
 

@@ -1,7 +1,7 @@
 """Optimisers: gradient descent, Adam, L-BFGS and a line search.
 
-The points that an optimiser evaluates must depend only on its settings and on earlier losses and gradients, because
-resuming a search replays them. Random numbers must come from a seed in the settings.
+An optimiser must choose points only from its settings and from earlier losses and gradients, because a resumed search
+replays the logged evaluations. Random numbers must come from a seed in the settings.
 """
 
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from cortado.optimisation.search import Optimiser, Outcome, ParameterLayout, Sea
 
 PerParameter = float | Mapping[str, float]
 HALVINGS = 10
-"""Greatest number of halvings of one step before the search ends."""
+"""Greatest number of times that a refused step is halved before the search ends."""
 GROWTH = 3.0
-"""Longest trial of the line search, relative to the best length in the previous update."""
+"""Longest trial step of the line search, relative to the best step of the previous update."""
 SMALL = 0.01
 """Greatest ratio of the last to the first gradient for which L-BFGS reports convergence."""
 
@@ -43,7 +43,7 @@ def require_fraction(name: str, value: float) -> None:
 def require_names(name: str, values: PerParameter, layout: ParameterLayout) -> None:
     if isinstance(values, Mapping) and set(values) != set(layout.names):
         said = f"{name} is given for {quoted(values)}, but the optimised parameters are {quoted(layout.names)}"
-        raise InputError(f"{said}; give it for each of these, or one number for all.")
+        raise InputError(f"{said}; give a number for each optimised parameter, or one number for all.")
 
 
 class Iterate:
@@ -69,18 +69,18 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam: steps along the mean of recent gradients, divided by their root mean square.
+    """Adam: steps along the mean of recent gradients, divided by the root mean square of the gradients.
 
     A step changes a component by at most about the learning rate, for gradients of any size. Every update ends with a
     projection onto the bounds. If the run after a step diverges, Adam halves the step and the learning rate, at most 10
-    times, and resets both means to 0. Adam has no convergence test and makes all iterations.
+    times, and resets its two means to 0. Adam has no convergence test and makes all iterations.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1. Raises
     InputError for settings out of range.
 
     ``learning_rate`` is a number, or one number for each parameter by name [unit of the parameter]. ``beta1`` and
     ``beta2`` are the decay factors of the mean gradient and of the mean squared gradient, in [0, 1) [-]. ``epsilon`` is
-    added to the root to avoid a division by 0 [unit of the gradient].
+    added to the root of the mean squared gradient to avoid a division by 0 [unit of the gradient].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.Adam(0.1), iterations=50)``
     """
@@ -121,9 +121,9 @@ class Adam:
 class GradientDescent:
     """Gradient descent with a heavy ball: x_{k+1} = P(x_k - learning_rate g_k + momentum (x_k - x_{k-1})).
 
-    x_k are the parameters after k updates, g_k is the gradient at x_k, and P projects onto the bounds. If the run after
-    a step diverges, the step and the learning rate are halved, at most 10 times, and the momentum term is reset to 0.
-    The method has no convergence test and makes all iterations.
+    In this formula, x_k are the parameters after k updates, g_k is the gradient at x_k, and P projects onto the bounds.
+    If the run after a step diverges, the step and the learning rate are halved, at most 10 times, and the momentum term
+    is reset to 0. Gradient descent has no convergence test and makes all iterations.
 
     Source: B. T. Polyak, "Some methods of speeding up the convergence of iteration methods", USSR Computational
     Mathematics and Mathematical Physics 4(5), 1964. With momentum 0 the method is plain gradient descent. Raises
@@ -161,11 +161,11 @@ class LBFGS:
     """L-BFGS-B: a quasi-Newton method with bounds and a line search of one or more evaluations per iteration.
 
     L-BFGS finds accurate optima of smooth losses in few evaluations, but stops early if the gradient is noisy. The
-    coordinates are (x - start) / scale for parameters x, and the loss is divided by the greatest component of the first
-    gradient in these coordinates. The first trial step is therefore at most about `scale` long.
+    coordinates are (x - start) / scale for parameters x. The loss is divided by the greatest component of the first
+    gradient in these coordinates. So the first trial step is at most about `scale` long.
 
     With more than about 10^4 components the last bits of sums depend on the number of BLAS threads. Resume a large
-    search with the same number of threads. If the numbers of a resumed run differ, an error is raised.
+    search with the same number of threads. A resumed run raises an error if its numbers differ from the logged numbers.
 
     Source: R. H. Byrd, P. Lu, J. Nocedal and C. Zhu, SIAM Journal on Scientific Computing 16(5), 1995, as in
     `scipy.optimize.minimize(method="L-BFGS-B")`. Raises InputError for settings out of range.
@@ -238,16 +238,16 @@ class LBFGS:
             },
         )
         left = _greatest_projected(search, physical(found.x), found.jac, np.ones_like(scale))
-        share = f"the gradient is {left:.2g} of the first one"
+        share = f"the gradient is {left:.2g} times the first gradient"
         if found.status == 1:
             ended = f"made all its {found.nit} iterations without converging: {share}. More may lower the loss."
         elif left < SMALL:
-            how = "converged" if found.status == 0 else "stopped at an optimum to rounding"
+            how = "converged" if found.status == 0 else "stopped at an optimum within round-off errors"
             ended = f"{how} after {found.nit} iterations: {share}."
         else:
             why = "the loss has stopped falling" if found.status == 0 else "no step along its direction lowers the loss"
-            ended = f"stopped after {found.nit} iterations, as {why}, but {share}: the loss is too rough for it, so"
-            ended += " try LineSearch from here."
+            ended = f"stopped after {found.nit} iterations, as {why}, but {share}: the loss is too rough for L-BFGS."
+            ended += " Continue with LineSearch from the last parameters."
         return Outcome(physical(found.x), found.status == 0 and left < SMALL, f"L-BFGS {ended}")
 
 
@@ -260,27 +260,28 @@ def _greatest_projected(search: Search, x: Vector, gradient: Vector, scale: Vect
 class LineSearch:
     """Gradient descent that tries steps of several lengths and takes the step with the lowest loss.
 
-    Use `LineSearch` for rough losses, and for gradients with the right direction but a wrong size, as in long runs. The
-    search steps over local minima that are narrower than its trials. The search never steps to a point at which the run
-    diverges or a parameter is out of range. A trial is a run without a gradient, and all trials of an update form one
-    batch.
+    Use `LineSearch` for rough losses, and for gradients with the right direction but a wrong size, as in long runs.
+    `LineSearch` steps over local minima that are narrower than a trial step. The search never steps to a point at which
+    the run diverges or a parameter is out of range. A trial is a run without a gradient, and all trials of an update
+    form one batch.
 
     Update k moves the parameters x_k along a direction d_k. The vector g_k is the gradient times the scale. The
-    function unit(a) divides a vector a by its root mean square:
+    function unit(a) divides a vector a by the root mean square of its components. Each update is
 
-        d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k),
+        d_k = unit(momentum d_{k-1} - unit(g_k)),   x_{k+1} = the best of P(x_k + r_k s scale d_k).
 
-    over lengths s from ``shortest`` to 1 in a geometric sequence. P projects onto the bounds. The reach r_k is 1 at
-    first, and later 3 times the best length, at most 1. If no trial lowers the loss, the update still takes the best
-    trial and sets the reach to 1, to leave narrow local minima. The last iterate need not be the best one.
+    The step lengths s form a geometric sequence from ``shortest`` to 1. P projects onto the bounds. The reach r_k
+    begins at 1. Each later reach is 3 times the best step length of the previous update, at most 1. If no trial lowers
+    the loss, the update still takes the trial with the lowest loss, and sets the reach to 1, in order to leave narrow
+    local minima. The last iterate need not be the best one.
 
-    If every trial diverges, the parameters stay, and the reach is multiplied by ``shortest``. The method has no
-    convergence test and makes all iterations. Raises InputError for settings out of range.
+    If every trial diverges, the parameters stay unchanged, and the reach is multiplied by ``shortest``. The line search
+    has no convergence test and makes all iterations. Raises InputError for settings out of range.
 
     ``scale`` is the longest change of a parameter in a trial, as a number or as one number for each parameter by name
-    [unit of the parameter]. ``trials`` is the number of lengths per update, at most 1,000. ``shortest`` is the ratio of
-    the shortest to the longest length. ``momentum`` is the factor of the previous direction in the new direction, in
-    [0, 1) [-].
+    [unit of the parameter]. ``trials`` is the number of step lengths per update, at most 1,000. ``shortest`` is the
+    ratio of the shortest to the longest step length. ``momentum`` is the factor of the previous direction in the new
+    direction, in [0, 1) [-].
 
     Example: ``found = cortado.optimise(problem, start, cortado.optimisers.LineSearch(scale=0.5), iterations=20)``
     """
@@ -297,7 +298,7 @@ class LineSearch:
         require_fraction("shortest", self.shortest)
         if not is_whole(self.trials) or self.trials < 2 or self.shortest == 0.0:
             said = f"trials is {shown(self.trials)} and shortest {shown(self.shortest)}"
-            raise InputError(f"{said}, but must be at least 2 and greater than 0.")
+            raise InputError(f"{said}, but trials must be at least 2, and shortest must be greater than 0.")
         require_at_most("trials", self.trials, 1_000)
 
     def check(self, layout: ParameterLayout) -> None:
@@ -339,9 +340,9 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
             raise InputError(f"The optimiser is {shown(optimiser)}, but must be {wanted}.")
         known = {field.name: field.default is MISSING for field in fields(BY_NAME[optimiser])}
         if unknown := sorted(set(settings) - set(known)):
-            raise InputError(f"{quoted(unknown)} is no setting of '{optimiser}', whose settings are {quoted(known)}.")
+            raise InputError(f"'{optimiser}' has no setting {quoted(unknown)}; its settings are {quoted(known)}.")
         if missing := [setting for setting, needed in known.items() if needed and setting not in settings]:
-            raise InputError(f"'{optimiser}' needs {quoted(missing)}; its settings are {quoted(known)}.")
+            raise InputError(f"'{optimiser}' needs a value for {quoted(missing)}; its settings are {quoted(known)}.")
         made: Optimiser = BY_NAME[optimiser](**settings)
         return made
     if isinstance(optimiser, type) or not isinstance(optimiser, Optimiser):
@@ -349,7 +350,7 @@ def as_optimiser(optimiser: Any, settings: Mapping[str, Any]) -> Optimiser:
         raise InputError(f"{said}, or one of {quoted(BY_NAME)}, not {shown(optimiser)}.")
     if settings:
         said = f"optimise was given {quoted(settings)}, but takes settings only with the name of an optimiser"
-        raise InputError(f"{said}, as an object has its own.")
+        raise InputError(f"{said}: give the settings to the optimiser object.")
     return optimiser
 
 

@@ -1,8 +1,8 @@
 """The interface between optimisers and problems, and the replay log of evaluations.
 
-Optimisers are deterministic: with the losses and gradients of an earlier run they take the same steps. The replay log
-of all evaluations is therefore a checkpoint of any optimiser. The log is an append-only file. An sqlite3 database would
-need locks, which file systems of clusters may lack.
+Optimisers are deterministic: equal losses and gradients lead to equal steps. The replay log of all evaluations
+therefore serves as a checkpoint for every optimiser. The replay log is an append-only file, because an sqlite3 database
+needs file locks, and some cluster file systems have none.
 """
 
 import json
@@ -75,7 +75,7 @@ class ReplayLog:
     """A replay log in one file of a folder. A killed process loses at most the evaluation that it is writing.
 
     The file is a line of JSON with the format, names, shapes and settings, followed by one record of fixed size per
-    evaluation. A record is little-endian. It consists of the index (uint64), the loss, parameters and gradient
+    evaluation. A record is little-endian and consists of the index (uint64), the loss, parameters and gradient
     (float64), and the CRC-32 of the preceding values (uint32). Every record is on the disk before `append` returns. The
     next evaluation overwrites an incomplete last record.
     """
@@ -96,7 +96,7 @@ class ReplayLog:
                 has_records = bool(file.read(1))
             if has_records:
                 said = f"'{path}' already holds the evaluations of an optimisation"
-                raise InputError(f"{said}; go on with it by resume=True, or give another checkpoint folder.")
+                raise InputError(f"{said}; continue the search by resume=True, or give another checkpoint folder.")
         if not resume or not path.exists():
             with sentences(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -126,7 +126,7 @@ class ReplayLog:
             os.fsync(self._file.fileno())
         except OSError as problem:
             said = f"An evaluation cannot be written to '{self._path}': {problem.strerror or problem}"
-            advice = f"free some space and resume. The {self._count} evaluations before it are kept"
+            advice = f"free some space and resume. The {self._count} earlier evaluations are kept"
             raise ComputationError(f"{said}; {advice}.") from problem
         self._count += 1
 
@@ -148,9 +148,9 @@ class ReplayLog:
                 if len(former) == len(given):
                     differing = [pair for pair in zip(former, given, strict=True) if pair[0] != pair[1]]
                     former, given = ([pair[k] for pair in differing] for k in range(2))
-                begun = f"'{self._path}' cannot be resumed, because it was begun with {key} = {'; '.join(former)}"
-                now = f"is now given {key} = {'; '.join(given)}"
-                raise InputError(f"{begun} and {now}; give the former, or another checkpoint folder.")
+                begun = f"'{self._path}' cannot be resumed, because the search began with {key} = {'; '.join(former)}"
+                now = f"now has {key} = {'; '.join(given)}"
+                raise InputError(f"{begun} and {now}; repeat the earlier settings, or give another checkpoint folder.")
         first, complete = self._file.tell(), 0
         records = (self._file.seek(0, os.SEEK_END) - first) // self._record_size
         self._file.seek(first)
@@ -161,7 +161,7 @@ class ReplayLog:
             complete += 1
         if complete < records - 1:
             said = f"Evaluation {complete} of the {records} in '{self._path}' is damaged"
-            raise InputError(f"{said}; restore the file from a copy, or begin again in another checkpoint folder.")
+            raise InputError(f"{said}; restore the file from a copy, or begin a search in another checkpoint folder.")
         return first, complete
 
 
@@ -197,7 +197,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of an optimiser: its last iterate, and how the search ended."""
+    """The result of an optimiser: the last iterate, and a description of the end of the search."""
 
     last: Vector
     """Last iterate (size,), which has been evaluated."""

@@ -1,4 +1,4 @@
-"""Plots, pictures and films of a solved task, and the input of ``cortado fit``, which is a scene with measured data."""
+"""Plots, pictures and films of a solved task, and readers of scenes with measured data for ``cortado fit``."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -66,7 +66,7 @@ class KnotValues:
     """Values (k, d) or (k,) at the start of the search."""
     estimate: np.ndarray
     true: np.ndarray | None
-    """Best approximation of the true parameter (k, d) or (k,). None if the target is a picture."""
+    """Knot values (k, d) or (k,) that approximate the true parameter best. None if the target is a picture."""
 
     def for_machines(self) -> dict[str, np.ndarray]:
         known = {} if self.true is None else {"true": self.true}
@@ -243,16 +243,16 @@ def load_fit(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Fit
     file = os.fspath(path)
     data = read_toml(path, overrides, ("optimise", "dataset"))
     if "fit" not in data:
-        raise SceneError(file, "fit", MISSING, "a table; a task with [optimise] is solved by cortado optimise")
+        raise SceneError(file, "fit", MISSING, "a table; use cortado optimise for a task with [optimise]")
     if "optimise" in data:
-        raise SceneError(file, "optimise", GIVEN, "left out of a fit, whose search [fit] describes")
+        raise SceneError(file, "optimise", GIVEN, "left out; use [fit] to describe the search of a fit")
     first, read = _read(data, file, tables.FitTables)
     others = []
     for name in first.problem.also:  # in which a table [fit] is ignored
         path = os.fspath(Path(file).parent / name)
         other, _ = _read(read_toml(path), path, ExperimentTables)
         if other.problem.also:
-            wanted = "left out, as another file names this one"
+            wanted = "left out, as another file lists this file"
             raise SceneError(path, "problem.also", list(other.problem.also), wanted)
         others.append(other)
     return FitTask((first, *others), read.fit)
@@ -283,7 +283,7 @@ def _video(table: tables.VideoTable, simulation: Simulation, folder: Path, last:
 def _series(table: tables.SensorSeriesTable, simulation: Simulation, folder: Path, last: float) -> Observation:
     sensors = sensors_of(simulation.scene)
     if table.sensor not in sensors:
-        raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'the [[sensor]]s'}.")
+        raise InputError(f"sensor is {table.sensor!r}, but must be one of {', '.join(sensors) or 'a [[sensor]]'}.")
     sensor, path = sensors[table.sensor], folder / table.file
     known = sensor.columns(simulation.dimension)
     data = _with(measured_columns(path, known, table.sensor, sensors), ("time",), path)
@@ -294,7 +294,7 @@ def _series(table: tables.SensorSeriesTable, simulation: Simulation, folder: Pat
     names = [name for name in data if name != "time"]
     for name in names:
         if name not in known:
-            raise InputError(f"{path} has the column {name!r}, but must have some of {', '.join(known)}.")
+            raise InputError(f"{path} has the column {name!r}, but the known columns are {', '.join(known)}.")
     times = data["time"]
     chosen = _within(times + table.start, last)
     values = np.stack([data[name] for name in names], axis=1) if names else np.zeros((len(times), 0))
@@ -313,14 +313,14 @@ def _tracks(table: tables.TracksTable, simulation: Simulation, folder: Path, las
     if (often > 1).any():
         k, tracer = once[:, int(np.argmax(often > 1))]
         found = f"{often.max()} lines for tracer {tracers[tracer]:g} at {times[k] - table.start:g} s"
-        raise InputError(f"{path} has {found}, but must have one: give each tracer its own number.")
+        raise InputError(f"{path} has {found}, but must have one line: give each tracer its own number.")
     places = np.full((len(times), len(tracers), len(axes)), np.nan)
     places[when, who] = np.stack([data[axis] for axis in axes], axis=1)
     begin = int(np.argmin(np.abs(times)))
     missing = tracers[np.isnan(places[begin]).any(axis=1)]
     if abs(times[begin]) > 1e-9 * max(last, 1e-300) or len(missing):
         lacking = f" of tracer {missing[0]:g}" if len(missing) else ""
-        raise InputError(f"{path} lacks the place{lacking} at the start of the run, time {-table.start:g} s.")
+        raise InputError(f"{path} lacks the position{lacking} at the start of the run, time {-table.start:g} s.")
     chosen = _within(times, last) & (times > 0.0)
     clock = table.calibrate, table.start
     return Tracks(simulation, places[begin], times[chosen] - table.start, places[chosen], table.noise, *clock)
@@ -333,7 +333,7 @@ def _within(times: np.ndarray, last: float) -> np.ndarray:
 def _with(data: dict[str, np.ndarray], wanted: tuple[str, ...], path: Path) -> dict[str, np.ndarray]:
     for name in wanted:
         if name not in data:
-            raise InputError(f"{path} has the columns {', '.join(data)}, but must have {name}.")
+            raise InputError(f"{path} has the columns {', '.join(data)}, but must have the column {name}.")
         if name in ("time", "tracer") and not np.isfinite(data[name]).all():
             line = int(np.argmin(np.isfinite(data[name]))) + 2
             raise InputError(f"{path}: line {line} has the {name} {data[name][line - 2]:g}, but must have a number.")

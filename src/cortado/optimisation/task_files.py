@@ -48,10 +48,10 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     data = read_toml(path, overrides, ("fit", "dataset"))
     scene = scene_from_dict(data, file)
     if not any(key in data for key in TaskTables.model_fields):
-        raise SceneError(file, "problem", MISSING, "a table; a scene without one is run by cortado run")
+        raise SceneError(file, "problem", MISSING, "a table; use cortado run for a scene without [problem]")
     if "fit" in data:
         others = "solved by cortado fit, as its target was measured"
-        raise SceneError(file, "fit", GIVEN, others if "optimise" not in data else "left out of a search")
+        raise SceneError(file, "fit", GIVEN, others if "optimise" not in data else "left out, as [optimise] is given")
     if scene.solver.chooses:
         wanted = "a number of seconds in a task, whose runs are compared step by step"
         raise SceneError(file, "solver.time_step", "auto", wanted)
@@ -59,12 +59,12 @@ def load_task(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Ta
     problem, optimise = tables.problem, tables.optimise
     try:
         if problem.measured:
-            raise SceneError(None, "problem.measured", GIVEN, "left out: measured data is fitted by cortado fit")
+            raise SceneError(None, "problem.measured", GIVEN, "left out; use cortado fit for measured data")
         true, steps = problem.target or {}, problem.steps
         scene = scene.lasting(steps=steps)
         for name in optimise.start:
             if problem.picture is None and name not in true:
-                raise SceneError(None, f"problem.target.{name}", MISSING, "given, as optimise.start has it")
+                raise SceneError(None, f"problem.target.{name}", MISSING, "given, as in optimise.start")
         true = _resolved("problem.target", true, scene, steps, known)
         start = _resolved("optimise.start", optimise.start, scene, steps, known)
         _check_options(problem, optimise, start, known)
@@ -85,7 +85,7 @@ def read_tables(data: Mapping[str, Any], scene: Scene, file: str, model: type[Ta
     except SceneError as error:
         raise error.in_file(file) from None
     except InputError as error:
-        raise SceneError(file, "", sentence=f"cannot be a task: {error}") from None
+        raise SceneError(file, "", sentence=f"does not describe a task: {error}") from None
 
 
 def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, known: Known) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def _resolved(table: str, values: Mapping[str, Any], scene: Scene, steps: int, k
             raise SceneError(None, field, GIVEN, f"left out, as the scene {parameter.absent}")
         for view, other in known.views.items():
             if name == other and view in values:
-                raise SceneError(None, field, GIVEN, f"left out, as {view} is given in its place")
+                raise SceneError(None, field, GIVEN, f"left out, as {view} is given")
         if isinstance(array, str):
             found[name] = array
             continue
@@ -128,12 +128,12 @@ def _check_range(parameter: Parameter, field: str, array: np.ndarray) -> None:
 def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mapping[str, Any], known: Known) -> None:
     over_time = [name for name in known.over_time if name in start and known.has_rows(name, start[name])]
     if optimise.knots is not None and not over_time:
-        raise SceneError(None, "optimise.knots", optimise.knots, "left out, as nothing that is optimised has rows")
+        raise SceneError(None, "optimise.knots", optimise.knots, "left out, as no searched parameter has rows")
     if optimise.knots is not None and optimise.knots > problem.steps:
         raise SceneError(None, "optimise.knots", optimise.knots, f"at most the number of steps, {problem.steps}")
     for name in optimise.logarithmic:
         if name not in start:
-            raise SceneError(None, "optimise.logarithmic", name, "made of parameters that optimise.start has")
+            raise SceneError(None, "optimise.logarithmic", name, "a list of parameters in optimise.start")
         if name == "mass_fractions" or (optimise.knots is not None and name in over_time):
             wanted = "made of other parameters: mass fractions and knots have coordinates of their own"
             raise SceneError(None, "optimise.logarithmic", name, wanted)
@@ -152,7 +152,7 @@ def _check_options(problem: ProblemTable, optimise: OptimiseTable, start: Mappin
     }
     for field, (is_given, value) in of_images.items():
         if problem.loss != "image" and is_given:
-            raise SceneError(None, field, value, "left out, as positions are compared")
+            raise SceneError(None, field, value, 'left out, as problem.loss is not "image"')
     if problem.picture is not None and "parameter_error" in check.model_fields_set:
         wanted = "left out, as the target is a picture, not a run with true parameters"
         raise SceneError(None, "optimise.check.parameter_error", check.parameter_error, wanted)
@@ -163,17 +163,17 @@ def _check_bounds(
 ) -> None:
     field = f"optimise.bounds.{name}"
     if name not in start:
-        raise SceneError(None, field, GIVEN, "left out, as optimise.start lacks it")
+        raise SceneError(None, field, GIVEN, "left out, as it is not in optimise.start")
     if name == "mass_fractions":
-        raise SceneError(None, field, GIVEN, "left out, as fractions stay from 0 to 1 by themselves")
+        raise SceneError(None, field, GIVEN, "left out, as a search keeps fractions from 0 to 1")
     value = start[name]
     if pair.ndim == 0 or len(pair) != 2:
         wanted = "two entries, the lower and the upper bound"
         raise SceneError(None, field, Words(_in_words([pair.shape])), wanted)
     if (pair[0] > pair[1]).any():
-        raise SceneError(None, field, pair.tolist(), "two entries, the lower one not above the upper one")
+        raise SceneError(None, field, pair.tolist(), "two entries, with no lower bound above an upper bound")
     if name in optimise.logarithmic and (pair <= 0.0).any():
-        raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is changed by factors")
+        raise SceneError(None, field, pair.tolist(), "greater than 0, as the parameter is in optimise.logarithmic")
     _check_range(known[name], field, pair)
     shape = _shapes(known[name], scene, 0)[0] if isinstance(value, str) else value.shape
     if optimise.knots is not None and known.has_rows(name, value):
@@ -301,7 +301,7 @@ def _targets(task: Task, simulation: Simulation, renderer: Renderer | None) -> d
         ends = Problem(simulation, task.problem.steps, nothing).states(task.true_parameters, steps)
     except DivergedError as error:
         run = "this is the run that makes the target, with the parameters of problem.target"
-        raise error.with_advice(f"{run}; {error.advice}, or change those") from None
+        raise error.with_advice(f"{run}; {error.advice}, or change the true parameters") from None
     except InputError as error:
         raise InputError(f"problem.target: {error}") from None
     if renderer is None:

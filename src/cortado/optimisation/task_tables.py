@@ -89,7 +89,7 @@ Values = Annotated[dict[str, Any], BeforeValidator(_arrays), WithJsonSchema(VALU
 Start = Annotated[
     dict[str, Any], BeforeValidator(partial(_arrays, words=(RANDOM,))), WithJsonSchema(_schema(words=(RANDOM,)))
 ]
-"""Parameter values by name. First positions and mass fractions may be the word "random"."""
+"""Parameter values by name. Initial positions and mass fractions may be the word "random"."""
 ParameterName = Annotated[str, OneOf(NAMES), WrapValidator(_known)]
 
 
@@ -110,19 +110,19 @@ class VideoTable(MeasuredTable):
     kind: Literal["video"]
     """The measurements are frames of a video."""
     frame_rate: Annotated[float, quantity("1/s", gt=0.0)] | None = None
-    """Frames per second; by default the frame rate of the video. A folder of pictures needs this key."""
+    """Frames per second. The default is the frame rate of the video. A folder of pictures needs this key."""
     every: Annotated[int, count(1, 1_000_000)] = 1
     """Use only every n-th frame."""
     crop: Annotated[tuple[Pixel, ...], components("left", "top", "right", "bottom")] | None = None
-    """Part of each frame that is compared, as a rectangle in pixels; by default the whole frame."""
+    """Part of each frame that is compared, as a rectangle in pixels. The default is the whole frame."""
     mask: Text | None = None
-    """Picture whose black pixels are ignored, in the size of the frames. Its path is relative to the folder of the
-    task's file."""
+    """Picture of the size of the frames. Black pixels are ignored. The path is relative to the folder of the task's
+    file."""
     calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
-    """Quantities that are also fitted: parameters of the camera, the extinction of the fluid, or "start" for the start
+    """Additional quantities to fit: parameters of the camera, the extinction of the fluid, or "start" for the start
     time of the file."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
-    """Standard deviation of the linear light of a pixel; by default it is estimated from the residuals."""
+    """Standard deviation of the linear light of a pixel. The default is an estimate from the residuals."""
 
 
 class SensorSeriesTable(MeasuredTable):
@@ -134,9 +134,9 @@ class SensorSeriesTable(MeasuredTable):
     sensor: Text
     """Name of the [[sensor]] in the scene."""
     calibrate: Clock = ()
-    """["start"] to fit the start time of the file too."""
+    """The value ["start"] adds the start time of the file to the fitted quantities."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
-    """Standard deviation of a reading, in its unit; by default it is estimated from the residuals."""
+    """Standard deviation of a reading, in its unit. The default is an estimate from the residuals."""
 
 
 class TracksTable(MeasuredTable):
@@ -146,9 +146,9 @@ class TracksTable(MeasuredTable):
     kind: Literal["tracks"]
     """The measurements are paths of tracers, which move with the fluid."""
     calibrate: Clock = ()
-    """["start"] to fit the start time of the file too."""
+    """The value ["start"] adds the start time of the file to the fitted quantities."""
     noise: Annotated[float, quantity("m", gt=0.0)] | None = None
-    """Standard deviation of a coordinate [m]; by default it is estimated from the residuals."""
+    """Standard deviation of a coordinate [m]. The default is an estimate from the residuals."""
 
 
 AnyMeasured = Annotated[VideoTable | SensorSeriesTable | TracksTable, Field(discriminator="kind")]
@@ -167,20 +167,20 @@ Schedule = Annotated[Several[Annotated[float, quantity(gt=0.0, le=1.0)]], WrapVa
 
 
 class ProblemTable(Table):
-    """[problem]: the number of time steps and the target. The target is a picture, or the end of a run with true
+    """[problem]: the number of time steps and the target. The target is a picture, or the result of a run with true
     parameters."""
 
     steps: Annotated[int, count(0, 10_000_000)]
-    """Number of time steps; 0 to compute the loss of the initial state."""
+    """Number of time steps. With 0 steps, the loss uses the initial state."""
     loss: Literal["positions", "image"] = "positions"
     """Data that are compared with the target: positions of particles, or images."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
-    """Distance between images: the squared difference, or an image pyramid, which suits shapes that do not overlap at
-    the start."""
+    """Distance between images: the squared difference, or an image pyramid. A pyramid suits shapes that do not overlap
+    at the start of the search."""
     frames: Annotated[int, count(1, 10_000)] = 1
-    """Number of states that are compared with the target, evenly spaced in time up to the last state."""
+    """Number of compared states. The states are evenly spaced in time up to the last state."""
     target: Values | None = None
-    """True parameters by name. The target is the result of a run with these parameters. Give either target or
+    """True parameters by name. The target is the result of a run with the true parameters. Give either target or
     picture."""
     picture: Text | None = None
     """"heart", "rosetta", or a picture file, relative to the folder of the task's file."""
@@ -194,26 +194,26 @@ class ProblemTable(Table):
     def _check_measured(self) -> Self:
         if not self.measured:
             if self.also:
-                raise field_error(("also",), list(self.also), "left out, as nothing is measured")
+                raise field_error(("also",), list(self.also), "left out, as problem.measured is missing")
             return self._check_target()
         for name in sorted({"loss", "distance", "frames", "target", "picture"} & self.model_fields_set):
-            raise field_error((name,), Words("given"), "left out, as there is measured data")
+            raise field_error((name,), Words("given"), "left out, as problem.measured is given")
         names = [one.name for one in self.measured]
         for k, name in enumerate(names):
             if name in names[:k] or "." in name:
-                raise field_error(("measured", k, "name"), name, "a name of its own, without a dot")
+                raise field_error(("measured", k, "name"), name, "a unique name without a dot")
         return self
 
     def _check_target(self) -> Self:
         has_picture, most = self.picture is not None, max(self.steps, 1)
         if not has_picture and self.target is None:
-            raise field_error(("target",), MISSING, f"{wanted(VALUES)}, as there is no picture")
+            raise field_error(("target",), MISSING, f"{wanted(VALUES)}, as problem.picture is missing")
         has_idle_distance = self.loss != "image" and "distance" in self.model_fields_set
         for is_wrong, name, words in (
             (has_picture and self.target is not None, "picture", "left out, as there is a target"),
             (has_picture and self.loss != "image", "loss", '"image", as there is a picture'),
             (has_picture and self.frames > 1, "frames", "1, as there is a picture, which is one"),
-            (has_idle_distance, "distance", "left out, as positions are compared"),
+            (has_idle_distance, "distance", 'left out, as problem.loss is not "image"'),
             (self.frames > most, "frames", f"at most {most}, as there are {self.steps} steps"),
         ):
             if is_wrong:
@@ -230,11 +230,11 @@ class CheckTable(Table):
     """[optimise.check]: criteria that the estimate must meet."""
 
     loss_reduction: Annotated[float, quantity(ge=1.0)] = 1.0
-    """Least ratio of the first loss to the best loss."""
+    """Least allowed ratio of the first loss to the lowest loss."""
     parameter_error: Annotated[float, quantity(gt=0.0)] = 1e50
     """Greatest allowed relative error (L2) of an estimated parameter."""
     psnr: Annotated[float, quantity("dB", ge=0.0)] = 0.0
-    """Least peak signal-to-noise ratio between the image of the estimate and the target image."""
+    """Least allowed peak signal-to-noise ratio between the image of the estimate and the target image."""
 
 
 class GradientTable(Table):
@@ -243,35 +243,35 @@ class GradientTable(Table):
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """Name of the estimator. "adjoint_viscosity" suits long splashes."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
-    """Coefficient C of `AdjointViscosity`; by default 2. The strength of the viscosity is C times the strain
-    in a step."""
+    """Coefficient C of `AdjointViscosity`; by default 2. The coefficient multiplies the strain in a time step to give
+    the strength of the viscosity."""
     samples: Annotated[int, count(1, 10_000)] = 1
     """Number of runs over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
-    """Width of the ensemble for every searched parameter by name, in the units of its knots or logarithms. This key is
-    needed with several samples. Samples may be out of bounds, so search positive parameters by their logarithm."""
+    """Width of the ensemble by parameter name, in the units of the searched values, knots or logarithms. This key is
+    needed with several samples. Samples may be out of bounds. Search positive parameters by their logarithm."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
-    """Standard deviation of the random displacements of first positions in the ensemble."""
+    """Standard deviation of the random displacements of initial positions in the ensemble."""
 
     @model_validator(mode="before")
     @classmethod
     def _has_no_strength(cls, given: Any) -> Any:
         if isinstance(given, Mapping) and "strength" in given:
-            words = "left out, as the strength follows the flow now; coefficient is a factor on it"
+            words = "left out: the strength now follows the flow, and coefficient is a factor of the strength"
             raise field_error(("strength",), given["strength"], words)
         return given
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.coefficient is not None and self.name != "adjoint_viscosity":
-            raise field_error(("coefficient",), self.coefficient, "left out, as nothing is smoothed")
+            raise field_error(("coefficient",), self.coefficient, 'given for "adjoint_viscosity" only')
         if self.samples != 1 and (self.samples % 2 or self.samples < 4):
             raise field_error(("samples",), self.samples, "1, or an even number of at least 4")
         if self.samples > 1 and self.spread is None:
-            raise field_error(("spread",), MISSING, "a table of numbers greater than 0, as there are several samples")
+            raise field_error(("spread",), MISSING, "a table of numbers greater than 0, as samples is above 1")
         for name in ("spread", "position_noise"):
             if self.samples == 1 and name in self.model_fields_set:
-                raise field_error((name,), Words("given"), "left out, as there is one sample")
+                raise field_error((name,), Words("given"), "left out, as samples is 1")
         for name, number in (self.spread or {}).items():
             if number.ndim or not number > 0.0:
                 raise field_error(("spread", name), number.tolist(), "a number greater than 0")
@@ -294,7 +294,7 @@ class OptimiseTable(Table):
     """[optimise]: the start, the algorithm and the length of the search."""
 
     start: Start
-    """First values of the searched parameters by name. First positions and mass fractions may be the word "random"."""
+    """Start values by parameter name. Initial positions and mass fractions may be the word "random"."""
     knots: Annotated[int, count(2, 10_000_000)] | None = None
     """Number of knots in time for the linear interpolation of parameters over time. By default every time step has a
     separate value."""
@@ -324,7 +324,7 @@ class OptimiseTable(Table):
     @model_validator(mode="after")
     def _check_tolerance(self) -> Self:
         if self.tolerance is not None and self.optimiser != "lbfgs":
-            raise field_error(("tolerance",), self.tolerance, 'left out, as only "lbfgs" has one')
+            raise field_error(("tolerance",), self.tolerance, 'given for "lbfgs" only')
         return self
 
     def algorithm(self) -> Optimiser:
@@ -348,13 +348,13 @@ class FitTable(Table):
     """Lower and upper bound by parameter name. A value with equal bounds is not fitted."""
     iterations: Annotated[int, count(1, 10_000)] = 50
     """Greatest number of trial points of each of the two fits. The first fit gives all residuals equal weights. The
-    second fit uses weights from the noise that the first fit found."""
+    weights of the second fit come from the noise in the residuals of the first fit."""
     starts: Annotated[int, count(1, 100)] | None = None
-    """Number of starts of the fit. By default the fit has one start, and three more if its result is doubtful. Further
-    starts lie within the bounds. Without bounds, positive parameters vary by a factor of up to 100."""
+    """Number of starts of the fit. By default the fit has one start. If the result is doubtful, three further starts
+    follow. Further starts lie within the bounds. Without bounds, positive parameters vary by a factor of up to 100."""
     profiles: Annotated[int, count(0, 100)] = 7
-    """Number of points in the profile of the sum of squares for each fitted value; 0 for no profiles. At each point of
-    a profile, all other values are fitted again."""
+    """Number of points in the profile of the sum of squares for each fitted value. The number 0 gives no profiles. At
+    each point of a profile, all other values are fitted again."""
 
 
 class FitTables(Table):

@@ -49,7 +49,7 @@ class Logarithm:
     def coordinate(self, parameter: np.ndarray) -> np.ndarray:
         number = as_numbers("a parameter", parameter)
         if not (number > 0.0).all():
-            raise InputError("A parameter that is changed by factors must be greater than 0.")
+            raise InputError("A parameter that is searched by its logarithm must be greater than 0.")
         return np.log(number)
 
     def adjoint(self, u: np.ndarray, bar: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ class TimeInterpolation:
 
 @fixed
 class Affine:
-    """The transform p = base + matrix u, for example for accelerations of a tank with a fixed end position."""
+    """The affine transform p = base + matrix u. An example is the acceleration of a tank with a fixed end position."""
 
     def __init__(self, base: Any, matrix: Any):
         """``base`` has the shape and unit of the parameter. ``matrix`` has the shape ``base.shape + u.shape``."""

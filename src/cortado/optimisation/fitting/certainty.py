@@ -1,25 +1,25 @@
 """Standard errors of a least-squares estimate if residuals are correlated within a frame and from frame to frame.
 
-Near the estimate the residuals are r = e - J t. Here e (frames, m) is the noise, J (frames, m, parameters) the
-Jacobian, and t the error of the estimate. The m numbers of a frame are not independent, because neighbouring pixels,
-and all light of a frame, vary together.
+Near the estimate, the residuals are r = e - J t with the noise e (frames, m), the Jacobian J (frames, m, parameters)
+and the error t of the estimate. The m numbers of a frame are not independent: neighbouring pixels vary together, and so
+does all light of a frame.
 
 1. The correlation of noise at two times is exp(-dt / T), where dt is the difference of the times. The correlation time
-   T is chosen to reproduce the correlation of residuals in neighbouring frames (`correlation_time`). A second fit uses
-   frames that are `whitened` in time.
+   T is chosen to reproduce the correlation of residuals in neighbouring frames (`correlation_time`). `whitened` removes
+   the correlation in time from the frames of a second fit.
 2. Within a frame the noise has an arbitrary covariance C, which is the same for every frame. The covariance of the
    score J^T e is the sum
 
-       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T
+       B = sum_f J_f^T C J_f  with  C = 1 / F sum_h r_h r_h^T.
 
-   over F frames f and h with whitened residuals r_h. B has F times as many samples as the cluster-robust sum of
-   (J_f^T r_f)(J_f^T r_f)^T (Liang and Zeger 1986). The covariance of the estimate is N^-1 B N^-1 with the Hessian
-   N = sum_f J_f^T J_f.
-3. On average the fit absorbs a part of the noise, and B is corrected for this part. The degrees of freedom of
+   The indices f and h run over F frames, and r_h are whitened residuals. The sum B uses F times as many samples as the
+   cluster-robust sum of (J_f^T r_f)(J_f^T r_f)^T (Liang and Zeger 1986). The fitted parameters have the covariance
+   N^-1 B N^-1, where N = sum_f J_f^T J_f is the Hessian.
+3. The fit absorbs a part of the noise, and B is corrected for the mean of this part. The degrees of freedom of
    Student's distribution follow Satterthwaite (1946).
-4. The correlation time T is uncertain too. The variance of an estimate is proportional to (1 + c) / (1 - c), where c is
-   the correlation from frame to frame. The variance of c is (1 - c^2) / n for n independent numbers. To second order,
-   B is therefore larger by the factor 1 + 2 / (n (1 - c)) on average.
+4. The correlation time T also has an error. The variance of an estimate is proportional to (1 + c) / (1 - c), where c
+   is the correlation from frame to frame. The variance of the correlation c is (1 - c^2) / n for n independent numbers.
+   To second order, this error of c makes B larger by the factor 1 + 2 / (n (1 - c)) on average.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ SHORTEST = 0.05
 @dataclass(frozen=True)
 class Products:
     S: np.ndarray
-    """Products of two frames' Jacobians and the noise covariance (F, F, p, p)."""
+    """Products of the Jacobians of two frames and the noise covariance (F, F, p, p)."""
     K: np.ndarray
     """Products of two frames' Jacobians (F, F, p, p)."""
     gram: np.ndarray
@@ -60,7 +60,7 @@ class ScoreCovariance:
     """Covariance (p, p) of the score, which is the transposed Jacobian times the noise."""
     products: Products
     lost: float
-    """Mean fraction of the covariance that the fit removes from the residuals."""
+    """Mean fraction of the noise covariance that the fit absorbs."""
     samples: float
     frames: float
 
@@ -103,7 +103,7 @@ def independent_frames(times: np.ndarray, correlation_time: float) -> float:
 
 
 def score_covariance(J: np.ndarray, r: np.ndarray, inverse: np.ndarray, frames: float) -> ScoreCovariance:
-    """Estimate the score's covariance from whitened residuals r (F, m), Jacobians J (F, m, p) and N^-1."""
+    """Estimate the score's covariance from whitened residuals (F, m), Jacobians (F, m, p) and the inverse Hessian."""
     F, products = len(r), Products.of(J, r)
     B = np.einsum("ffpq->pq", products.S)
     once = np.einsum("fhpq,qr,hfrs->ps", products.K, inverse, products.S, optimize=True) / F
@@ -212,12 +212,12 @@ def inverse(problem: LeastSquares, N: np.ndarray) -> np.ndarray:
         raise ComputationError("The derivatives are not finite: try fewer steps, or float64.")
     if not size.all():
         lost = [label for label, s in zip(labels, size, strict=True) if not s]
-        raise ComputationError(f"The measurements do not depend on {', '.join(lost)}: leave it out of the fit.")
+        raise ComputationError(f"The measurements do not depend on {', '.join(lost)}: fit only other parameters.")
     eigenvalues, axes = np.linalg.eigh(N / np.outer(size, size))
     if eigenvalues[0] < 1e-10:
         mixed = [label for label, a in zip(labels, axes[:, 0], strict=True) if abs(a) > 0.1]
         said = f"The measurements do not distinguish {' and '.join(mixed)}"
-        raise ComputationError(f"{said}: leave one of them out of the fit, or measure something else, too.")
+        raise ComputationError(f"{said}: fit fewer parameters, or add measurements of another quantity.")
     return np.asarray((axes / eigenvalues) @ axes.T / np.outer(size, size))
 
 

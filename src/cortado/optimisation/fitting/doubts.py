@@ -1,7 +1,7 @@
-"""Sentences of doubt about a fitted model, with possible causes, if residuals are larger than the noise.
+"""Sentences on possible errors of a fitted model, if the residuals do not look like noise.
 
-Possible causes are a trend, a late clock, a wrong density, or slipping walls. Each cause changes the predictions along
-a direction. The size of the change is fitted together with the parameters, with an error bar.
+Possible errors are a trend, a late clock, a wrong density, or slipping walls. Each of these causes changes the
+predictions along a known direction. A fit with the parameters gives the size of each change and an error bar.
 """
 
 import warnings
@@ -20,7 +20,7 @@ from cortado.optimisation.fitting.observations import CLOCK
 from cortado.scene.parameter_values import Arrays
 
 TOO_LARGE_IN_MOTION = 2.0
-"""Least ratio of residuals of changing predictions to residuals of constant predictions for a doubt."""
+"""Least ratio of the residuals of changing numbers to the residuals of constant numbers for a doubt."""
 EXACT = 1e-4
 """Residuals below this fraction of the largest measured number are negligible."""
 
@@ -35,20 +35,20 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
         if noise is not None and size > 1.3 * noise:
             against = f"{size:.2g} against {noise:.2g} {part.observation.unit}"
             given = f"are {size / noise:.2g} times the noise that was given ({against})"
-            found.append(f"The residuals of {part.label} {given}: the model is wrong by that much.")
+            found.append(f"The residuals of {part.label} {given}: the model has an error of this size.")
         still, moving = still_and_moving(part.observation.measured, r)
         if moving > TOO_LARGE_IN_MOTION * still:
             found.append(
                 f"The residuals of {part.label} are {moving / still:.2g} times as large where the model changes as "
-                f"where it stays as it is ({moving:.2g} against {still:.2g} {part.observation.unit}): there it is "
-                "wrong by that much, and the error bars are too small."
+                f"where the model is constant ({moving:.2g} against {still:.2g} {part.observation.unit}): the "
+                "model has an error of this size in motion, and the error bars are too small."
             )
         length = times[-1] - times[0]
         if weight.correlation_time > 0.35 * length:
             found.append(
-                f"The residuals of {part.label} hardly change from frame to frame: they are correlated over "
-                f"{weight.correlation_time:.2g} s of a record of {length:.2g} s, which noise seldom is. The model is "
-                f"probably wrong by about {size:.2g} {part.observation.unit}, and the error bars are too small."
+                f"The residuals of {part.label} hardly change from frame to frame: the correlation time is "
+                f"{weight.correlation_time:.2g} s in a record of {length:.2g} s. Noise is seldom so slow. The model "
+                f"probably has an error of about {size:.2g} {part.observation.unit}, and the error bars are too small."
             )
     if not is_exact:
         found += _halves(problem, at, weights, certainty) + _trends_and_clocks(problem, at, weights)
@@ -56,17 +56,17 @@ def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty
     for which, ends in zip(("lower", "upper"), coordinates.bounds, strict=True):
         for label, u, end, value in zip(problem.labels, at.u, ends, coordinates.numbers(at.u), strict=True):
             if np.isfinite(end) and abs(u - end) <= 1e-6 * max(abs(end), 1.0):
-                asked = "what was measured asks for a value beyond it, and its error bar tells nothing"
+                asked = "the measurements fit better beyond the bound, and the error bar is meaningless"
                 found.append(f"{label} is {value:.4g}, its {which} bound: {asked}.")
     for label, bar in zip(problem.labels, np.where(coordinates.by_logarithm, bars, 0.0), strict=True):
         if bar > 1.0:
             factor = np.exp(min(bar, 20.0))
-            found.append(f"What was measured hardly tells {label}: one standard error is a factor of {factor:.2g}.")
+            found.append(f"The measurements hardly determine {label}: one standard error is a factor of {factor:.2g}.")
     return tuple(found)
 
 
 def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return root mean square residuals of constant predictions, such as a background, and of other predictions."""
+    """Return the root mean square residuals of constant numbers, such as a background, and of changing numbers."""
     change = np.ptp(measured + r, axis=0)
     counted = ~np.isnan(change)
     still = counted & (change <= 0.01 * np.max(change[counted], initial=0.0))
@@ -77,7 +77,7 @@ def still_and_moving(measured: np.ndarray, r: np.ndarray) -> tuple[float, float]
 
 
 def _halves(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> list[str]:
-    """Return sentences on parameters whose estimates from the first and second half of the frames differ."""
+    """Return a sentence for each parameter that differs between fits of the first and the second half of the frames."""
     size, steps, variances = len(at.u), [], []
     white, slopes = (weighted(problem.parts, weights, own) for own in (at.residuals, at.jacobians))
     for half in (0, 1):
@@ -93,10 +93,10 @@ def _halves(problem: LeastSquares, at: Linearised, weights: Weights, certainty: 
         steps.append(-inverse @ s)
         variances.append(np.diag(inverse @ B @ inverse))
     away = np.abs(steps[0] - steps[1]) / np.sqrt(variances[0] + variances[1] + 1e-300)
-    differ = "The first half of the frames and the second one say different things of"
-    wrong = "times the error of the difference. The model is wrong, in a way that changes over time."
+    differ = "The first and the second half of the frames give different values of"
+    wrong = "times its standard error. The model has an error that changes over time."
     each = zip(problem.labels, away, strict=True)
-    return [f"{differ} {label}: by {off:.2g} {wrong}" for label, off in each if off > 3.0]
+    return [f"{differ} {label}: the difference is {off:.2g} {wrong}" for label, off in each if off > 3.0]
 
 
 class Explained(NamedTuple):
@@ -111,8 +111,8 @@ def explained(
 ) -> Explained | None:
     """Estimate the sizes of possible causes by a Gauss-Newton step. Return None if noise can explain the residuals.
 
-    ``columns`` are derivatives (frames, m, causes) of the predictions of each observation. If ``is_doubted`` is true,
-    the residuals are not noise, and the causes must explain half of the sum of squares.
+    ``columns`` are the derivatives (frames, m, causes) of each observation's predictions with respect to the causes. If
+    ``is_doubted`` is true, the test for noise is left out, and the causes must explain half of the sum of squares.
     """
     from scipy.stats import f as fisher
 
@@ -151,7 +151,7 @@ def explained(
 
 
 def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences on causes that need additional runs: a wrong density, or slip."""
+    """Return sentences on causes that need additional runs: a wrong density, or a wrong slip condition."""
     values, found = problem.coordinates.values(at.u), list[str]()
 
     def by_density(experiment: Experiment, own: Arrays) -> Arrays:
@@ -189,7 +189,7 @@ def dear_causes(problem: LeastSquares, at: Linearised, weights: Weights) -> list
         said = explains(by_slip)
         if said and said.sizes[0] > 0.0:
             would = f"would explain {said.share:.0%} of the squares of the residuals: is container.slip right?"
-            found.append(f"The other slip of the container {would}")
+            found.append(f"The other value of container.slip {would}")
     return found
 
 
@@ -198,7 +198,7 @@ def _nothing(problem: LeastSquares, count: int) -> list[np.ndarray]:
 
 
 def _trends_and_clocks(problem: LeastSquares, at: Linearised, weights: Weights) -> list[str]:
-    """Return sentences on late clocks, and on trends of observations with at most four numbers per frame."""
+    """Return sentences on late clocks, and on trends in observations with at most four numbers per frame."""
     found, late = list[str](), list[str]()
     for k, part in enumerate(problem.parts):
         times, measured = part.observation.times, part.observation.measured
@@ -212,8 +212,8 @@ def _trends_and_clocks(problem: LeastSquares, at: Linearised, weights: Weights) 
                 which = f"number {number + 1} of " if measured.shape[1] > 1 else ""
                 found.append(
                     f"The residuals of {which}{part.label} have a trend, from {course[0]:.2g} to {course[-1]:.2g} "
-                    f"{part.observation.unit}, which is {said.share:.0%} of their squares and no noise: the model is "
-                    "wrong in a way that grows or fades."
+                    f"{part.observation.unit}, which is {said.share:.0%} of their squares and no noise: the model has "
+                    "an error that grows or fades."
                 )
         if CLOCK not in part.observation.start:
             columns, rates = _nothing(problem, 1), np.gradient(np.nan_to_num(measured) + at.residuals[k], times, axis=0)
@@ -222,6 +222,6 @@ def _trends_and_clocks(problem: LeastSquares, at: Linearised, weights: Weights) 
             if said and abs(said.sizes[0]) < times[-1] - times[0]:
                 late.append(
                     f"Frames of {part.label} that are {said.sizes[0]:.2g} s later would explain {said.share:.0%} of "
-                    f'the squares of the residuals: is its clock right? calibrate = ["{CLOCK}"] searches it.'
+                    f'the squares of the residuals: is the clock right? Fit the clock by calibrate = ["{CLOCK}"].'
                 )
     return found + late

@@ -21,7 +21,7 @@ from cortado.scene.stability import is_implicit
 from cortado.simulation import Simulation
 
 ROOM = 16
-"""Number of additional steps of a run for a late clock."""
+"""If a fitted clock shifts frames beyond the end of a run, the run gets a multiple of this number of steps more."""
 
 
 @fixed
@@ -50,13 +50,13 @@ class Experiment:
             raise InputError("observations is empty, but must have at least one measurement.")
         for name, one in observations.items():
             if not hasattr(one, "measured"):
-                raise InputError(f"observations {name} is {shown(one)}, but must be one such as a measured.Video.")
+                raise InputError(f"observations {name} is {shown(one)}, but must be such as a measured.Video.")
             seen = getattr(getattr(one, "renderer", None), "inputs", {}).get("positions", simulation.positions.shape)
             if seen != simulation.positions.shape:
-                found = f"sees positions {seen}, but must see {simulation.positions.shape}, those of the simulation"
+                found = f"renders positions {seen}, but the simulation has positions {simulation.positions.shape}"
                 raise InputError(f"observations {name} {found}.")
         if simulation.scene.solver.chooses:
-            raise InputError('solver.time_step is "auto", but must be a number of seconds, as frames are at times.')
+            raise InputError('solver.time_step is "auto", but must be a number of seconds in an experiment.')
         step = float(simulation.scene.solver.time_step)
         last = max(float(one.times[-1]) for one in observations.values())
         steps = int(np.ceil(last / step - 1e-6)) if steps is None else check_steps(steps)
@@ -84,7 +84,7 @@ class Experiment:
 
     @property
     def clocks(self) -> dict[str, tuple[float, float]]:
-        """Return the bounds of each clock [s]. A clock may move by half of the duration of its measurement."""
+        """Return the bounds of each clock [s]. A fit may shift a clock by half of the duration of the measurement."""
         found = {}
         for name, one in self.observations.items():
             if CLOCK in one.start:
@@ -149,7 +149,7 @@ class Experiment:
         return self._read(ends, frames, parameters), found
 
     def _frames(self, parameters: Values) -> tuple[dict[str, Frames], list[int]]:
-        """Return the frames of each observation, and the steps whose states the frames need."""
+        """Return the frames of each observation, and the numbers of the steps whose states the frames need."""
         found, wanted = dict[str, Frames](), set[int]()
         for name, one in self.observations.items():
             begun = one.start.get(CLOCK, 0.0)
@@ -183,8 +183,8 @@ class Experiment:
             own = self._own(name, parameters)
             found[name] = frames[name].between({step: one.value(ends[step], own) for step in frames[name].needed})
             if found[name].shape != one.measured.shape:
-                said = f"{name} measured {one.measured.shape} numbers"
-                raise InputError(f"{said}, but the simulation has {found[name].shape}.")
+                said = f"{name} has measured numbers of shape {one.measured.shape}"
+                raise InputError(f"{said}, but the simulation predicts shape {found[name].shape}.")
         return found
 
     def _shared(self, values: Values) -> dict[str, Any]:

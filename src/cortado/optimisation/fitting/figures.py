@@ -31,7 +31,7 @@ def residual_figure(fitted: Fit, path: Path) -> Figures:
             axes.axhline(0.0, color=FAINT, linewidth=1.0)
             axes.set(title=part.label, ylabel=f"residual [{part.part.observation.unit}]")
         rows[-1].set_xlabel("time [s]")
-    words = "Residuals, predicted less measured: noise scatters around 0; what stays on one side is the model's error."
+    words = "Residuals, predicted minus measured. Noise scatters around 0; residuals on one side are model errors."
     return [(words, path)]
 
 
@@ -52,7 +52,7 @@ def profile_figure(profiles: Sequence[Profile], path: Path) -> Figures:
             axes.set_visible(False)
         panels[0].set_ylabel("squared standard errors")
         panels[0].legend(loc="upper center")
-    words = "By how much the sum of squares grows beside its least; below the faint line lie two standard errors."
+    words = "Growth of the sum of squares from its minimum. The faint line is at two standard errors."
     return [(words, path)]
 
 
@@ -71,7 +71,7 @@ def video_figures(fitted: Fit, folder: Path) -> Figures:
                     pictures.append(picture)
                     titles.append(f"{title}, {video.times[k]:.3g} s")
             path = images(pictures, titles, folder / f"measured_{number}.png")
-            words = "On the right grey is where both agree, light where too much light was found."
+            words = "In the right picture, grey pixels agree, and light pixels are too bright in the simulation."
             found.append((f"Frames of {part.label}. {words}", path))
     return found
 

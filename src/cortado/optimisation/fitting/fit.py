@@ -21,8 +21,8 @@ from cortado.scene.parameter_values import UNITS
 from cortado.scene.parameters import Range
 
 NOISE_ALONE = (
-    "The bars are of noise alone and leave out what the spacing and the time step have wrong: a fit with another "
-    "discretisation.spacing shows how much that is."
+    "The error bars include noise only, and no errors of the spacing and the time step: a fit with another "
+    "discretisation.spacing shows the size of these errors."
 )
 OF_VIEWS = {"translation": "m", "rotation": "rad", "field_of_view": "degrees", "width": "m", "extinction": "1/m"}
 OF_VIEWS["start"] = "s"
@@ -40,7 +40,7 @@ class Profile:
     deviance: np.ndarray
     """Sum of squares minus its minimum (points,), in squared standard errors."""
     expected: np.ndarray
-    """Deviance of the linear model (points,), on which the confidence intervals are based."""
+    """Deviance of the linear model (points,). Confidence intervals are based on this model."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ class Fit:
     parts: tuple[FittedPart, ...] = field(repr=False)
     """Residuals of each observation and their statistics."""
     doubts: tuple[str, ...] = field(repr=False)
-    """Sentences on residuals that do not look like noise. The error of the model is then larger than the error bars."""
+    """Sentences on residuals that do not look like noise. The model then has errors above the error bars."""
     converged: bool = True
-    """True if the search ended at a minimum of the sum of squares, and False if it ran out of iterations."""
+    """True if the search ended at a minimum of the sum of squares, and False if it made all its iterations before."""
     tried: tuple[Tried, ...] = field(default=(), repr=False)
     """Starts and ends of all searches, including the search of this fit."""
     runs: int = 0
@@ -161,10 +161,10 @@ class Fit:
         return {name: (lower[name], upper[name]) for name in lower}
 
     def profile(self, label: str, points: int = 7, reach: float = 2.5) -> Profile:
-        """Compute the least sum of squares at ``points`` values of the number ``label``. All remaining numbers are
-        fitted at each value. The values range from -``reach`` to +``reach`` standard errors around the estimate. If the
-        profile is not a parabola, the confidence intervals are rough. Raises `InputError` for an unknown label, or if
-        the fit was pickled."""
+        """Compute the least sum of squares at ``points`` values of the fitted number with this ``label``. All remaining
+        numbers are fitted at each value. The values range from -``reach`` to +``reach`` standard errors around the
+        estimate. The confidence intervals are rough if the profile is not a parabola. Raises `InputError` for an
+        unknown label, or if the fit was loaded from a pickle."""
         if label not in self.labels or self.problem is None or self.at is None:
             raise InputError(f"label is {shown(label)}, but must be one of {', '.join(self.labels)}.")
         k, weights = self.labels.index(label), [part.weighting for part in self.parts]
@@ -186,11 +186,11 @@ class Fit:
 
         The prior is flat in the coordinates within the bounds. Coordinates of positive numbers are logarithms. The
         result is -inf outside the bounds, and if the run diverges. `Fit.coordinates.values` converts coordinates to
-        parameters. Raises `InputError` for a wrong shape, or if the fit was pickled.
+        parameters. Raises `InputError` for a wrong shape, or if the fit was loaded from a pickle.
 
-        The result is minus half of the weighted sum of squares, relative to the minimum. With correlated noise the
-        error bars are longer than the sum of squares suggests. Let V be the covariance of the estimate, and N the
-        Hessian of the sum of squares. Distances from the estimate are multiplied by a matrix W with W^T N W = V^-1. The
+        The result is minus half of the weighted sum of squares, relative to the minimum. If noise is correlated, the
+        sum of squares gives too short error bars. Distances from the estimate are therefore multiplied by a matrix W
+        with W^T N W = V^-1, where V is the covariance of the estimate, and N the Hessian of the sum of squares. The
         method is the curvature adjustment of Ribatet, Cooley and Davison (2012).
         """
         point = as_numbers("u", u)
@@ -198,7 +198,7 @@ class Fit:
             raise InputError(f"u has shape {point.shape}, but must be {self.u.shape}, one for each fitted number.")
         if self.problem is None:
             said = "The fit was pickled without its experiments"
-            raise InputError(f"{said}, which are needed to compute how likely other parameters are.")
+            raise InputError(f"{said}, but log_posterior needs the experiments.")
         lower, upper = self.coordinates.bounds
         wanted = np.linalg.cholesky(np.linalg.inv(self.coordinate_covariance))
         shortened = self.u + np.linalg.solve(np.linalg.cholesky(self.hessian).T, wanted.T @ (point - self.u))
@@ -242,10 +242,10 @@ class Fit:
 
     @property
     def cautions(self) -> list[str]:
-        """Return sentences on correlated numbers, an early end, rejected points, and doubts."""
-        apart = [f"{a} and {b} are hardly told apart (correlation {c:.3f})." for a, b, c in self.not_told_apart]
-        ended = [] if self.converged else ["The fit has not converged: give it more iterations."]
-        lost = f"The runs at {counted(self.refused, 'point')} that the fit tried diverged, and it knows nothing of them"
+        """Return warnings about correlated numbers, missing convergence, rejected points, and doubts."""
+        apart = [f"{a} and {b} are hardly distinguished (correlation {c:.3f})." for a, b, c in self.not_told_apart]
+        ended = [] if self.converged else ["The fit has not converged: give more iterations."]
+        lost = f"The runs at {counted(self.refused, 'point')} of the search diverged, and the fit ignores these points"
         refused = [f"{lost}: try a smaller solver.time_step, or bounds."] if self.refused else []
         return [*apart, *ended, *refused, *self.doubts]
 
@@ -255,7 +255,7 @@ def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error. An error that begins with 1 to 3 has two digits, or else one digit."""
+    """Format a value and its standard error. An error from 1 to 3 has two digits, others one."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))
@@ -381,7 +381,7 @@ def _from(problem: LeastSquares, start: np.ndarray, iterations: int) -> Fit:
 
 
 def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
-    """Return the searches with other ends than ``found``, sorted by misfit."""
+    """Return the searches that ended at a minimum other than ``found``, sorted by misfit."""
     bars = np.sqrt(np.diag(found.coordinate_covariance))
     near = SAME * np.where(found.coordinates.by_logarithm, 1.0, np.abs(found.u))
     others = [one for one in tried if (np.abs(one.end - found.u) > np.maximum(FAR * bars, near)).any()]
@@ -401,4 +401,4 @@ def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
     label, value = found.labels[k], found.coordinates.numbers(other.end)[k]
     times = f"with residuals {np.exp(other.misfit - least):.3g} times as large"
     said = f"Another search ended where {label} is {value:.3g}, {times}"
-    return [f"{said}: what was measured hardly tells which of both is right."]
+    return [f"{said}: the measurements hardly decide between both results."]

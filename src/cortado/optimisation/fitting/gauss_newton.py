@@ -1,9 +1,9 @@
 """Minimise the sum of squares in few runs, by Gauss-Newton steps. The Jacobian is estimated from earlier runs.
 
 Predictions of particle simulations are rough functions of a parameter. A derivative may be much greater than the mean
-slope over one standard error, and error bars from this derivative are then too small. At the end of a search,
-`over_the_bars` therefore runs simulations two standard errors away from the minimum. If the derivatives do not predict
-the results, finite differences over two standard errors replace the derivatives.
+slope over one standard error. Error bars from such a derivative are too small. At the end of a search, `over_the_bars`
+runs simulations two standard errors away from the minimum. If the derivatives do not predict the results of these
+simulations, finite differences over two standard errors replace the derivatives.
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,13 @@ class Searched:
     at: Linearised
     """Last point, with an estimated Jacobian."""
     next: np.ndarray
-    """Next trial point (free,), at which no simulation was run."""
+    """Next trial point (free,), without a simulation."""
     gain: float
     converged: bool
 
 
 def least(problem: LeastSquares, at: Linearised, weights: Weights, trials: int) -> tuple[Linearised, bool]:
-    """Return the minimum of the sum of squares and True, or the lowest of ``trials`` points and False."""
+    """Return the point with the lowest sum of squares, and True if the search converged."""
     for _ in range(4):
         squares = max(problem.sum_of_squares(at.residuals, weights), TINY)
         found = search(problem, at, weights, trials, 9.0 / squares)  # a decrease of three standard errors
@@ -59,8 +59,8 @@ def search(
 ) -> Searched:
     """Reduce the sum of squares until the next step would reduce the sum by less than the fraction ``enough``.
 
-    The coordinates ``fixed`` stay constant. Each trial point needs one forward run. If a trial point does not help or
-    its run diverges, the next step is damped (Levenberg 1944, Marquardt 1963).
+    The coordinates ``fixed`` stay constant. Each trial point needs one forward run. If the sum of squares does not fall
+    or the run diverges, the next step is damped (Levenberg 1944, Marquardt 1963).
     """
     points, base = TrialPoints(problem, weights, at), 0
     failures, damping, lowest = 0, 0.0, problem.sum_of_squares(at.residuals, weights)
@@ -117,8 +117,8 @@ def next_point(
 
 
 def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tuple[Linearised, bool | None]:
-    """Replace wrong derivatives by finite differences over `REACH` standard errors. The second result is None for right
-    derivatives, or else whether the differences converged."""
+    """Replace wrong derivatives by finite differences over `REACH` standard errors. The second result is None without
+    replacement, True if the differences converged, and False otherwise."""
     axes = _axes(problem, at, weights)
     if all(_is_straight(problem, at, weights, axis) for axis in axes.T):
         return at, None
@@ -138,7 +138,7 @@ def over_the_bars(problem: LeastSquares, at: Linearised, weights: Weights) -> tu
 
 
 def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray:
-    """Return uncorrelated displacements of `REACH` standard errors, as columns of a matrix (free, free)."""
+    """Return a matrix (free, free) whose columns are uncorrelated displacements of `REACH` standard errors."""
     covariance = Certainty.of(problem, at, weights).covariance
     axes = REACH * np.linalg.cholesky(covariance + (1e-12 * np.trace(covariance) + TINY) * np.eye(len(covariance)))
     longest = np.abs(axes[problem.coordinates.by_logarithm]).max(axis=0, initial=TINY)
@@ -146,7 +146,7 @@ def _axes(problem: LeastSquares, at: Linearised, weights: Weights) -> np.ndarray
 
 
 def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: np.ndarray) -> bool:
-    """Test whether the Jacobian predicts the residuals after the displacement ``axis``."""
+    """Return True if the Jacobian predicts the residuals after the displacement ``axis``."""
     each = zip(problem.parts, at.jacobians, strict=True)
     if all(np.abs(J @ axis).max() <= 1e-5 * np.nanmax(np.abs(part.observation.measured)) for part, J in each):
         return True
@@ -163,8 +163,8 @@ def _is_straight(problem: LeastSquares, at: Linearised, weights: Weights, axis: 
 def _differences(
     problem: LeastSquares, at: Linearised, weights: Weights, axes: np.ndarray
 ) -> tuple[Linearised, list[Linearised]]:
-    """Return the point with a Jacobian of finite differences along the axes, and all points of the differences. Of both
-    one-sided differences and the central difference, the smallest is used, because the point may lie on a kink."""
+    """Return the point with a Jacobian of finite differences along the axes, and all simulated points. The smallest of
+    two one-sided differences and the central difference is used, because the point may lie on a kink."""
     tried, columns = list[Linearised](), list[list[np.ndarray]]()
     for axis in axes.T:
         ends = [*_moved(problem, at, axis), *_moved(problem, at, -axis)]
@@ -183,7 +183,7 @@ def _differences(
 
 
 def _moved(problem: LeastSquares, at: Linearised, shift: np.ndarray) -> list[Linearised]:
-    """Return the displaced point within the bounds, or an empty list if its run diverges or the point is the same."""
+    """Return a list with the displaced, clipped point. The list is empty if the run diverges or the point stays."""
     point = np.clip(at.u + shift, *problem.coordinates.bounds)
     try:
         return [Linearised(point, problem.residuals(point), at.jacobians)] if (point != at.u).any() else []

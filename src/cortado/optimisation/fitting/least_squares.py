@@ -1,9 +1,9 @@
 """The least-squares problem of several experiments, as a function of one vector, and its Jacobians.
 
 The vector contains the values of the fitted parameters, or the logarithms of positive values. The Jacobian is computed
-only at the first point. At trial points the Jacobian is the slope of a Kriging interpolation of the residuals (Sacks,
-Welch, Mitchell and Wynn 1989). The interpolation is a linear function plus a random function with Matérn covariance of
-index 7/2. The width of the covariance is chosen by maximum likelihood.
+only at the first point of a search. At trial points the Jacobian is the slope of a Kriging interpolation of the
+residuals (Sacks, Welch, Mitchell and Wynn 1989). The interpolation is a linear function plus a random function with
+Matérn covariance of smoothness 7/2. The width of the covariance is chosen by maximum likelihood.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -91,7 +91,7 @@ class Frames:
         places = times / time_step
         if places[-1] > steps + 1e-6:
             said = f"times go up to {times[-1]:g} s"
-            raise InputError(f"{said}, but must end with the run, after {steps} steps of {time_step:g} s.")
+            raise InputError(f"{said}, but the run ends after {steps} steps of {time_step:g} s: give more steps.")
         whole = np.minimum(np.floor(places + 1e-6).astype(int), steps)
         shares = np.clip(places - whole, 0.0, 1.0)
         return cls(whole, np.where(shares < 1e-6, 0.0, shares))
@@ -105,7 +105,7 @@ class Frames:
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return the rates of change of readings at the frames (frames, ...) [1/s]. ``read`` is by step number."""
+        """Return time derivatives of readings (frames, ...), per second. ``read`` is by step number."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -118,15 +118,15 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
-    """Return the parameter "start" if ``calibrate`` has its name. ``alone`` forbids other names."""
+    """Return the parameter "start" if ``calibrate`` contains this name. ``alone`` forbids other names."""
     for name in calibrate if alone else ():
         if name != CLOCK:
-            raise InputError(f"calibrate has {shown(name)}, but must be made of {CLOCK}.")
+            raise InputError(f'calibrate has {shown(name)}, but must be empty or ["{CLOCK}"].')
     return {CLOCK: np.array(as_one_number("clock", start))} if CLOCK in calibrate else {}
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Return the times plus ``clock`` [s], the measured values, and the noise."""
+    """Check an observation. Return its times plus ``clock`` [s], its measured values, and its noise."""
     late = as_one_number("clock", clock)
     if not np.isfinite(late):
         raise InputError(f"clock is {late:g}, but must be a finite number of seconds.")
@@ -135,12 +135,12 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
     if moments.ndim != 1 or len(moments) < LEAST_FRAMES:
         found = f"has {len(moments)}" if moments.ndim == 1 else f"has shape {moments.shape}"
         said = f"times {found}, but must be a list of at least {LEAST_FRAMES} rising numbers"
-        raise InputError(f"{said}, as error bars come from the scatter from frame to frame.")
+        raise InputError(f"{said}, as error bars are computed from several frames.")
     if (falls := np.flatnonzero(np.diff(moments) <= 0.0)).size:
         before, after = moments[falls[0] : falls[0] + 2]
         raise InputError(f"times has {after:g} s after {before:g} s, but must rise from frame to frame.")
     if not np.isfinite(moments).all() or moments[0] < 0.0:
-        raise InputError(f"times begin with {moments[0]:g} s, but must be finite and not before the run.")
+        raise InputError(f"times begin with {moments[0]:g} s, but must be finite and at least 0.")
     if values.ndim != 2 or len(values) != len(moments):
         raise InputError(f"measured has shape {values.shape}, but must have {len(moments)} rows, one for each time.")
     if np.isinf(values).any() or np.isnan(values).all():
@@ -188,7 +188,7 @@ class Video:
         rows, columns, _ = renderer.shape
         inside = np.ones((rows, columns), dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         if inside.shape != (rows, columns) or not inside.any():
-            raise InputError(f"mask has shape {inside.shape}, but must be {(rows, columns)} and true somewhere.")
+            raise InputError(f"mask has shape {inside.shape}, but must have {(rows, columns)} and a true pixel.")
         self.renderer, self.mask = renderer, inside
         seen = pictures[:, inside].reshape(len(pictures), -1)
         self.times, self.measured, self.noise = checked(times, seen, noise, clock)
@@ -271,7 +271,7 @@ class SensorSeries:
         if array.ndim != 2 or array.shape[1] != len(names):
             raise InputError(f"values has shape {array.shape}, but must have columns for {', '.join(names)}.")
         if len({known[name] for name in names}) > 1:
-            raise InputError(f"columns are {', '.join(names)}, but must be of one unit: give each unit a series.")
+            raise InputError(f"columns are {', '.join(names)}, but must have one unit: give a series for each unit.")
         self.times, self.measured, self.noise = checked(times, array, noise, clock)
         self.unit, self.columns = known[names[0]], tuple(names)
         self._picked = np.array([list(known).index(name) for name in names])
@@ -293,13 +293,13 @@ class SensorSeries:
 
 @fixed
 class Tracks:
-    """Positions of tracers over time, as an observation of a fit. A tracer moves with the particles around its start:
+    """Tracer positions over time, as an observation of a fit. A tracer moves with the particles around its start:
 
-    X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)),
+    X(t) = X(0) + sum_i w_i (x_i(t) - x_i(0)).
 
-    where X is the position of the tracer, and x_i are the positions of the particles and their periodic images. The
-    weights w_i are values of Wendland's function (1995) of the distances at the start, divided by their sum. Positions
-    are not wrapped at periodic boundaries.
+    The vector X is the position of the tracer. The vectors x_i are the positions of the particles and of their periodic
+    images. The weight w_i is Wendland's function (1995) of the distance at the start, divided by the sum of all
+    weights. Positions are not wrapped at periodic boundaries.
 
     Example: ``tracks = cortado.measured.Tracks(simulation, first, times, positions, noise=0.001)``
     """

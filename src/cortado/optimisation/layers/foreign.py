@@ -64,9 +64,9 @@ class Packing:
         self._kept: dict[tuple[int, ...], tuple[list[Any], list[Any]]] = {}
 
     def at(self, addresses: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any]]:
-        """Return the flat arrays at the addresses of buffers, and their views by `cut`. The arrays are NumPy arrays if
-        ``device`` is None, and Warp arrays otherwise. Results are cached, because programs use the same few buffers
-        again."""
+        """Return the flat arrays at the addresses of buffers, and the views of the arrays by `cut`. The arrays are
+        NumPy arrays if ``device`` is None, and Warp arrays otherwise. Results are cached, because programs use the same
+        few buffers again."""
         return kept_or_made(self._kept, addresses, lambda _: self._made(addresses, device), KEPT)
 
     def _made(self, addresses: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any]]:
@@ -84,8 +84,8 @@ class Packing:
         return found
 
     def fill(self, whole: Sequence[Any], views: Sequence[Any], found: Sequence[Array]) -> None:
-        """Copy the arrays ``found`` to flat arrays with the given views. Arrays that are adjacent in GPU memory are
-        copied together."""
+        """Copy the arrays ``found`` to flat arrays ``whole``, whose parts are ``views``. Arrays that are adjacent in
+        GPU memory are copied together."""
         for result, group in zip(whole, self.groups.values(), strict=True):
             rest = group
             if isinstance(result, wp.array):
@@ -150,7 +150,7 @@ def _call_on_gpu(frame: Any) -> None:
 
 @cache
 def _own_stream(ordinal: int) -> Any:
-    """Return the one stream of all calls on a GPU, which orders them."""
+    """Return the stream of a GPU that all calls share, so that calls run in order."""
     return wp.Stream(wp.get_cuda_device(ordinal))
 
 
@@ -160,7 +160,6 @@ def _stream_at(ordinal: int, address: int) -> Any:
 
 
 def _handler(call: Callable[[Any], None]) -> Any:
-    """Make a callback for XLA that runs ``call`` and reports errors to XLA."""
 
     @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(xla_ffi.XLA_FFI_CallFrame))
     def handle(pointer: Any) -> Any:

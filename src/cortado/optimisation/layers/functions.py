@@ -47,10 +47,10 @@ LOSS, READING, PICTURE = "loss", "reading", "picture"
 
 
 class LayerParameters:
-    """A converter between the parameters of a layer and the parameters of a problem or stepper.
+    """A converter of the parameter arrays of a layer to parameters of a simulation, and of adjoints back to arrays.
 
-    ``each`` is True if the simulation is a batch that evaluates one layer several times. The first axis of every array
-    is then the evaluation. If ``each`` is False, a parameter of a batch may have any shape in `docs/batches.md`.
+    If ``each`` is True, each scene of the batch is one evaluation of the layer, and the first axis of every array
+    numbers the evaluations. If ``each`` is False, a parameter may have any shape that `docs/batches.md` allows.
     """
 
     def __init__(self, simulation: Simulation, steps: int, each: bool):
@@ -62,7 +62,7 @@ class LayerParameters:
         for name, shape in part(given, PARAMETER).items():
             shapes = self._space.shapes(name)
             if with_state and name in self._simulation.known.state:
-                raise InputError(f"parameter {name} is given, but must be left out with a state, which has its own.")
+                raise InputError(f"parameter {name} is given, but must be left out: the state has its own.")
             if shape not in shapes:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
 
@@ -97,7 +97,7 @@ class LayerParameters:
 
 
 class OfSimulation(Layer):
-    """Base class of layers with a state and parameters of a simulation as arguments."""
+    """Base class of layers whose arguments are a state and parameters of a simulation."""
 
     def __init__(self, simulation: Simulation, steps: int, each: bool = False):
         super().__init__()
@@ -196,7 +196,7 @@ class Evaluation:
 
 
 class Value(OfSimulation):
-    """A layer that computes the loss of a problem. Its arguments are parameters and, optionally, an initial state."""
+    """A layer that computes the loss of a problem. The arguments are parameters and, optionally, an initial state."""
 
     def __init__(self, problem: Problem, gradient: GradientEstimator | None = None, each: bool = False):
         if not isinstance(problem, Problem):
@@ -214,7 +214,7 @@ class Value(OfSimulation):
             check_state(own, self.states.shapes)
         if own and not isinstance(self._estimator, AdjointEstimator):
             kind = type(self._estimator).__name__
-            raise InputError(f"gradient is a {kind}, but must be an AdjointEstimator, as a state is given.")
+            raise InputError(f"gradient is a {kind}, but must be an AdjointEstimator if a state is given.")
         self._parameters.check(given, with_state=bool(own) or self._problem.state is not None)
 
     def outputs(self) -> dict[str, tuple[int, ...]]:
@@ -275,12 +275,12 @@ class Look:
 
 
 class Measure(OfSimulation):
-    """A layer that computes a sensor reading or a particle quantity. Its arguments are a state and the parameters of
+    """A layer that computes a sensor reading or a particle quantity. The arguments are a state and the parameters of
     the next step."""
 
     def __init__(self, simulation: Simulation, what: Sensor | str):
         if simulation.batch is not None:
-            raise InputError(f"simulation is a batch of {simulation.batch}, but must be of one scene to be measured.")
+            raise InputError(f"simulation is a batch of {simulation.batch} scenes, but must have one scene.")
         super().__init__(simulation, 1)
         self._name = check_quantity(what) if isinstance(what, str) else None
         self._sensor = None if isinstance(what, str) else checked_sensor(what)
@@ -345,7 +345,7 @@ class Measure(OfSimulation):
 
 
 class Picture(Layer):
-    """A layer that renders pictures on the host. Its arguments are positions (n, d) [m] and, optionally, mass fractions
+    """A layer that renders pictures on the host. The arguments are positions (n, d) [m] and, optionally, mass fractions
     (n, phases) and colours (phases, 3)."""
 
     def __init__(self, renderer: Renderer):
@@ -359,7 +359,7 @@ class Picture(Layer):
     def check(self, given: Shapes) -> None:
         wanted = self._renderer.inputs
         if "positions" not in given:
-            raise InputError(f"positions is left out, but must be an array {wanted['positions']}.")
+            raise InputError(f"positions is left out, but must be an array of shape {wanted['positions']}.")
         for name, shape in given.items():
             if shape != wanted[name]:
                 raise InputError(f"{name} has shape {shape}, but must have {wanted[name]}.")

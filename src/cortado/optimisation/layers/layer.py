@@ -1,6 +1,6 @@
 """Base classes of layers, which are differentiable functions of named arrays, and converters of states and parameters.
 
-If a layer is evaluated several times together, a parameter has either one value, or one value for each evaluation.
+If a layer computes several evaluations together, a parameter has one value for all evaluations or one for each.
 """
 
 import warnings
@@ -64,8 +64,8 @@ class Layer(ABC):
 
     @abstractmethod
     def evaluate(self, given: Named, keep: bool) -> tuple[Named, Any]:
-        """Return the results of the layer. If ``keep`` is true, also return a residual for `pull` and `push`. The next
-        call of the layer may overwrite the returned Warp arrays."""
+        """Return the results of the layer. If ``keep`` is true, also return a residual: data for `pull` and `push`. The
+        next call of the layer may overwrite the returned Warp arrays."""
 
     @abstractmethod
     def pull(self, residual: Any, bars: Named) -> Named:
@@ -78,10 +78,9 @@ class Layer(ABC):
         Missing tangents count as 0."""
 
     def check_mapped(self) -> None:
-        """Raise `InputError` if `many` is unavailable."""
         if self.unmapped:
             raise InputError(
-                f"{self.unmapped} cannot be mapped over a further axis: use one jax.vmap or torch.vmap alone."
+                f"{self.unmapped} cannot be mapped over a further axis: use a single jax.vmap or torch.vmap."
             )
 
     def many(self, size: int) -> "Layer":
@@ -96,15 +95,15 @@ class Layer(ABC):
 
 @dataclass(frozen=True)
 class Lost:
-    """The residual of a diverged evaluation. ``given`` contains the shapes of the arguments, and ``why`` is
-    the reason."""
+    """The residual of a diverged evaluation. ``given`` contains the shapes of the arguments, and ``why`` is the error
+    message."""
 
     given: Shapes
     why: str
 
     def along(self, of: Named, shapes: Shapes) -> Named:
-        """Return derivatives with the given ``shapes``. Derivatives are 0 if all arrays in ``of`` are 0. Otherwise the
-        derivatives are NaN."""
+        """Return derivatives with the given ``shapes``. Derivatives are 0 if all arrays in the dictionary ``of`` are 0.
+        Otherwise the derivatives are NaN."""
         number = np.nan if any(on_host(array).any() for array in of.values()) else 0.0
         return {name: np.full(shape, number) for name, shape in shapes.items()}
 
@@ -198,8 +197,8 @@ def rows(given: Named, chosen: int | np.ndarray) -> dict[str, Array]:
 
 
 def stacked(found: Iterable[Named]) -> dict[str, Array]:
-    """Stack the arrays of several dictionaries by name, along a new first axis. Each dictionary is copied at once,
-    because the next evaluation of a layer may overwrite its arrays."""
+    """Stack the arrays of several dictionaries by name, along a new first axis. Each dictionary is copied immediately,
+    because the next evaluation of a layer may overwrite the arrays."""
     tables = [copied(table) for table in found]
     return {name: _stack([table[name] for table in tables]) for name in tables[0]}
 
@@ -232,7 +231,7 @@ class NamedStates(HostStates):
     """A converter between states of a simulation and named arrays. Derivatives of states are converted too.
 
     The arrays have the names and shapes of the fields of a `RestartState`, and a ``time`` [s]. In a batch the first
-    axis is the scene. On a GPU, states and derivatives are not checked, to avoid copies to the host.
+    axis is the scene. On a GPU, the converter checks no states and derivatives, in order to avoid copies to the host.
     """
 
     def __init__(self, simulation: Simulation):
@@ -398,12 +397,12 @@ class NamedStates(HostStates):
 
     @cached_property
     def _later(self) -> wp.array:
-        """Times of the last returned state. The next call waits for the device before it overwrites this array."""
+        """Times of the last returned state. The next call waits for the device before overwriting the times."""
         return wp.empty_like(self._pinned, pinned=True)
 
     def _clock(self, time: float, step: float, last: float) -> Clock:
         """Return the clock of a state at a rounded ``time`` [s]. If the time is a multiple of ``step``, the clock
-        counts time steps. Later times are then equal to the times of an uninterrupted run, bit for bit."""
+        counts time steps, so that later times are bitwise equal to the times of an uninterrupted run."""
         if self._simulation.scene.solver.chooses:
             return Clock(0, time, last)
         steps = round(time / step) if np.isfinite(time) and time >= 0.0 else 0

@@ -49,14 +49,14 @@ class Bridge(ABC):
 
     @abstractmethod
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Return a function that evaluates a loss for k weights and k initial positions, stacked along a first axis.
-        The function returns the losses (k,). If ``slope`` is true, the function also returns their gradients by name.
+        """Return a function of k sets of weights and initial positions, stacked along a first axis. It returns the
+        losses (k,). If ``slope`` is true, the function also returns the gradients by name.
         """
 
     @abstractmethod
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
         """Return the value of a function at ``weights`` as an array of JAX or PyTorch. In reverse mode, the derivative
-        of this array is the function's gradient."""
+        of the returned array is the function's gradient."""
 
     def numbers(self, what: str, value: Any) -> np.ndarray:
         """Copy an array to the host in float64. Raises `InputError` if ``value`` is not an array of numbers."""
@@ -127,8 +127,7 @@ def restart_state(
     """Convert a state made of arrays to a restart state for `Simulation.run`, for files and for other processes. For a
     batch, return a tuple with a restart state for each scene.
 
-    ``given`` is a state of ``simulation``. If parameters of the run affect the state, ``parameters`` contains their
-    values.
+    ``given`` is a state of ``simulation``. ``parameters`` contains the parameters of the run that affect the state.
 
     Example: ``run = simulation.run(100, state=restart_state(simulation, end))``
     """
@@ -164,8 +163,8 @@ def step(
             Forward mode is always exact.
 
     Exact derivatives of chained steps are useful up to a horizon of some hundred steps. The command `cortado gradients
-    check` finds the horizon of a scene. A warning is given if adjoints grow by more than a factor of e^10 over a chain
-    of steps. Raises `InputError` for unsuitable arguments, and `DivergedError` if a particle is lost.
+    check` finds the horizon of a scene. A warning is given if adjoints grow by more than a factor of e^10 over several
+    chained steps. Raises `InputError` for unsuitable arguments, and `DivergedError` if a particle is lost.
 
     Example: ``end = step(simulation, state(simulation), {"viscosity": 0.1}, steps=5)``
     """
@@ -196,7 +195,7 @@ def rollout(
     arrays = {name: bridge.array(PARAMETER + name, value, layer) for name, value in table.items()}
     if simulation.batch is not None and any(name in simulation.known.over_time for name in arrays):
         over_time = ", ".join(name for name in arrays if name in simulation.known.over_time)
-        raise InputError(f"parameter {over_time} is given, but must be left out in a rollout of a batch: chain steps.")
+        raise InputError(f"parameter {over_time} is given, but must be left out in a rollout of a batch: use step.")
     known = simulation.known
     rows = {n: a for n, a in arrays.items() if n in known.over_time and len(a.shape) > known[n].rank}
     for name, array in rows.items():
@@ -236,9 +235,9 @@ def measure(bridge: Bridge, simulation: Simulation, what: Sensor | str) -> Calla
     """Return a function ``reading(state, parameters=None)`` of arrays. The argument ``what`` is a sensor of
     `cortado.sensors`, or a quantity of the particles, such as "pressure".
 
-    The reading of a sensor is an array (k,) with one number for each column. The reading of a quantity is (n,) or (n,
-    d). ``parameters`` are the parameters of the next time step, because the pressure is computed in that step. Raises
-    `InputError` if ``simulation`` is a batch.
+    The reading of a sensor is an array (k,) with one number for each column of the sensor. The reading of a quantity is
+    (n,) or (n, d). ``parameters`` are the parameters of the next time step, because the pressure is computed in that
+    step. Raises `InputError` if ``simulation`` is a batch.
 
     Example::
 
@@ -265,8 +264,8 @@ def picture(bridge: Bridge, renderer: Renderer, positions: Any, fractions: Any =
         fractions: mass fractions (n, phases), which may be left out for a single phase.
         colours: (phases, 3), by default the colours of the renderer.
 
-    Arrays are copied to the host, and derivatives exist in reverse mode only. Raises `InputError` for unsuitable
-    arguments.
+    Arrays are copied to the host. Derivatives of a picture exist in reverse mode only. Raises `InputError` for
+    unsuitable arguments.
 
     Example: ``image = picture(simulation.renderer(resolution=(64, 48)), end["positions"])  # (48, 64, 3)``
     """
@@ -293,7 +292,7 @@ def table_of(what: str, given: Table | None) -> Table:
     require_table(what, found, likely)
     for name in found:
         if not isinstance(name, str):
-            raise InputError(f"{what} has the name {shown(name)}, but must have texts as names.")
+            raise InputError(f"{what} has the name {shown(name)}, but names must be strings.")
     return found
 
 
@@ -324,8 +323,8 @@ class Loop:
         return self.simulation.room(1, 2**30 if estimator else 0.0)
 
     def together(self, points: Sequence[Values], estimator: AdjointEstimator | None = None) -> list[Estimate]:
-        """Estimate the losses and gradients of closed loops at several points in one batch. If a loss is infinite, its
-        estimate contains an error."""
+        """Estimate the losses and gradients of closed loops at several points in one batch. The estimate of an infinite
+        loss contains an error."""
         loops, gradient = LoopPass(self, points), dict[str, Any]()
         if estimator is not None:
             gradient = estimator.back(loops)
@@ -339,7 +338,7 @@ class Loop:
     def at(
         self, points: Sequence[Values], estimator: AdjointEstimator | None = None, slope: bool = False
     ) -> tuple[np.ndarray, Arrays]:
-        """Return the losses of k loops (k,) in float64. If ``slope`` is true, also return their gradients (k, ...) by
+        """Return the losses of k loops (k,) in float64. If ``slope`` is true, also return the gradients (k, ...) by
         name."""
 
         def loss(weights: Any, positions: Any) -> Any:
@@ -354,7 +353,7 @@ class Loop:
         losses, gradient = run(given, self._bridge.array("positions", positions, self._layer))
         found = self._bridge.numbers("the loss", losses)
         if found.shape != (len(points),):
-            raise InputError(f"loss returned an array {found.shape[1:]}, but must return one number.")
+            raise InputError(f"loss returned an array of shape {found.shape[1:]}, but must return one number.")
         return found, {name: self._bridge.numbers(name, array) for name, array in gradient.items()}
 
 
@@ -370,7 +369,7 @@ class LoopPass:
         return self._losses
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Run the loops a second time, and return the gradients (k, ...) by name."""
+        """Run the closed loops a second time, and return the gradients (k, ...) by name."""
         self._losses, gradient = self._loop.at(self._points, estimator, slope=True)
         return gradient
 
@@ -391,7 +390,7 @@ class Smoothed:
         self._bridge, self._estimator, self._loop = bridge, estimator, loop
 
     def __call__(self, weights: Mapping[str, Any]) -> Any:
-        """Return the mean of the loss over the ensemble. In reverse mode, the derivative of this mean is the smoothed
+        """Return the mean of the loss over the ensemble. In reverse mode, the derivative of the mean is the smoothed
         gradient, as in `estimate`."""
 
         def found(given: Mapping[str, Any]) -> tuple[float, Arrays]:
@@ -408,7 +407,7 @@ class Smoothed:
         given = table_of("weights", weights)
         own = {name: self._bridge.numbers(f"weight {name}", array) for name, array in given.items()}
         if DISPLACED in own:
-            raise InputError(f"weights has {DISPLACED}, but must have another name for it, as ensembles scatter these.")
+            raise InputError(f"weights has {DISPLACED}, but must have another name, as this name is reserved.")
         return estimate(self._loop, own, self._estimator)
 
 
@@ -422,9 +421,9 @@ def smoothed(
     """Return the ``loss`` of a closed loop, smoothed over an ensemble, as a function of ``weights``. Weights are arrays
     by name.
 
-    The value of the function is the mean of the loss over the ensemble, and its derivative is the smoothed gradient.
-    The method ``estimate(weights)`` of the function returns an `Estimate` of the mean and of the gradient, with the
-    standard error.
+    The value of the function is the mean loss over the ensemble. The derivative of the function is the smoothed
+    gradient. The method ``estimate(weights)`` of the function returns an `Estimate` of the mean and of the gradient,
+    with the standard error.
 
     Args:
         simulation: simulation in which the loop runs.
@@ -435,8 +434,8 @@ def smoothed(
             of the loss.
         state: initial state of the loops, by default the initial state of the scene.
 
-    Loops run in batches, by `torch.vmap` or by compiled `jax.vmap`. Raises `InputError` for unsuitable arguments. Also
-    raises `InputError` if a compiled program calls the function.
+    Closed loops run in batches, by `torch.vmap` or by compiled `jax.vmap`. Raises `InputError` for unsuitable
+    arguments, or if a compiled program calls the function.
 
     Example::
 

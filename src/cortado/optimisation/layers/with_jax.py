@@ -1,12 +1,12 @@
 """Layers as functions of JAX arrays: primitives with derivatives in forward and reverse mode, for `jax.vmap` and for
 compiled programs.
 
-Each layer is a JAX primitive. Its forward-mode rule evaluates the layer and calls a second primitive for the
-Jacobian-vector product. The transpose of the second primitive is a third primitive for the vector-Jacobian product.
-`jax.jvp` and `jax.grad` therefore use the same rules.
+Each layer is a JAX primitive. The forward-mode rule of the primitive evaluates the layer and calls a second primitive
+for the Jacobian-vector product. The transpose of the second primitive is a third primitive for the vector-Jacobian
+product. `jax.jvp` and `jax.grad` therefore use the same rules.
 
-JAX programs contain only arrays. Residuals are therefore stored in `RESIDUALS`, and an array called the ticket contains
-the number of a residual.
+JAX programs contain only arrays. The object `RESIDUALS` therefore stores the residuals of layers. A program carries the
+number of a residual in an array, called a ticket.
 """
 
 from collections import OrderedDict
@@ -36,7 +36,7 @@ try:
 except ModuleNotFoundError as error:
     raise LibraryMissingError("JAX", "jax") from error
 
-SECOND = "A second derivative is asked for, but there are first ones only: differentiate once."
+SECOND = "A second derivative is asked for, but only first derivatives exist: differentiate once."
 MOST_KEPT = 2**30
 TICKET = 2
 """Number of integers in a ticket."""
@@ -74,7 +74,7 @@ RESIDUALS = Residuals()
 
 def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tuple[Named, NDArray[np.int32]]:
     """Return the results of a layer. Unless ``entries`` is None, the layer is mapped over a first axis of length
-    ``entries``. If ``keep`` is true, the residual is stored, and the returned tickets (entries, 2) or (2,) identify it.
+    ``entries``. If ``keep`` is true, the layer's residual is stored under the returned tickets (entries, 2) or (2,).
     """
     own = layer if entries is None else layer.batched(entries)
     found, residual = own.evaluate(given, keep)
@@ -88,8 +88,8 @@ def evaluate(layer: Layer, entries: int | None, given: Named, keep: bool) -> tup
 def derivative(
     way: Way, layer: Layer, entries: int | None, tickets: NDArray[np.int32], given: Named, others: Named
 ) -> Named:
-    """Compute a Jacobian-vector product or a vector-Jacobian product of a layer at the arrays ``given``. ``others`` are
-    tangents of these arrays or adjoints of the results. ``tickets`` identify the residual."""
+    """Compute a Jacobian-vector product or a vector-Jacobian product of a layer at the arguments ``given``. ``others``
+    are tangents of the arguments or adjoints of the results. ``tickets`` identify the residual."""
     numbers, places = tickets.reshape(-1, TICKET).T
     last = way == "pull"
     kept = RESIDUALS.get(int(numbers[0]), last) if (numbers == numbers[0]).all() else None
@@ -135,7 +135,6 @@ def _of_given(number: Any, *avals: Any, names: Names, along: Names, **others: An
 
 
 def _primitive(name: str, run: Callable[..., list[Array]], results: Callable[..., list[Any]]) -> Any:
-    """Make a JAX primitive from a function of arrays."""
     made = Primitive(f"cortado_{name}")
     made.multiple_results = True
     made.def_abstract_eval(results)
@@ -243,7 +242,6 @@ class JaxBridge(Bridge):
     def repeated(
         self, step: Callable[[Any, Any], Any], state: dict[str, Any], rows: dict[str, Any], count: int
     ) -> dict[str, Any]:
-        """Apply a step repeatedly. In a compiled program the repetition is a loop."""
         if not any(isinstance(array, jax.core.Tracer) for array in jax.tree.leaves((state, rows))):
             return super().repeated(step, state, rows, count)
 
@@ -258,12 +256,12 @@ class JaxBridge(Bridge):
         return jax.jit(jax.vmap(jax.value_and_grad(loss) if slope else lambda *given: (loss(*given), {})))
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return a value and attach a given gradient to it by a custom JAX rule. This works only outside compiled
-        programs."""
+        """Return the value of ``found``, with its gradient as a custom JAX rule. Compiled programs cannot use the
+        rule."""
 
         def forward(given: Any) -> tuple[Any, Any]:
             if any(isinstance(array, jax.core.Tracer) for array in given.values()):
-                raise InputError("weights are traced by jax.jit or jax.vmap, but must be arrays: the loss is compiled.")
+                raise InputError("weights are traced by jax.jit or jax.vmap, but must be arrays: do not map the loss.")
             value, gradient = found(given)
             return jnp.asarray(value), {name: jnp.asarray(gradient[name], own.dtype) for name, own in given.items()}
 

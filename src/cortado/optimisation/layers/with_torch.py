@@ -20,7 +20,7 @@ except ModuleNotFoundError as error:
     raise LibraryMissingError("PyTorch", "torch") from error
 
 SECOND = (
-    "A second derivative is asked for, but there are first ones only: leave out create_graph=True, or take a gradient "
+    "A second derivative is asked for, but only first derivatives exist: leave out create_graph=True, or differentiate "
     "within torch.no_grad()."
 )
 Tensors = tuple[Any, ...]
@@ -47,7 +47,6 @@ class Call:
         return self.residual
 
     def pull(self, tensors: Tensors, bars: Tensors) -> Tensors:
-        """Return the adjoints of all tensors by a vector-Jacobian product."""
         with _in_order(_device(self.layer)):
             found = self.layer.pull(self.kept(tensors), _arrays(self.layer.outputs(), bars))
             each = zip(self.names, tensors, strict=True)
@@ -110,7 +109,6 @@ class _Linear(torch.autograd.Function):
 
 
 def _mapped(function: Any) -> Callable[..., tuple[Tensors, Any]]:
-    """Make the `vmap` rule of a layer's derivative."""
 
     def vmap(info: Any, in_dims: Sequence[int | None], call: Call, *tensors: Any) -> tuple[Tensors, Any]:
         size, count = info.batch_size, len(call.names)
@@ -178,7 +176,7 @@ class TorchBridge(Bridge):
         return lambda *given: mapped(*given)[::-1]
 
     def with_gradient(self, found: Callable[[Any], tuple[float, Mapping[str, np.ndarray]]], weights: Any) -> Any:
-        """Return a value and attach a given gradient to it."""
+        """Return the value of ``found`` as a tensor with the gradient of ``found``."""
         value, gradient = found(weights)
         own = {name: array for name, array in weights.items() if isinstance(array, torch.Tensor)}
         moved = (((array - array.detach()) * array.new_tensor(gradient[name])).sum() for name, array in own.items())
