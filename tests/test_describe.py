@@ -286,5 +286,5 @@ def test_a_task_is_told_in_words(capsys):
     Path("task.toml").write_text(GOOD_TASK)
     main(["describe", "task.toml"])
     search = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("search"))
-    assert "Which gravity makes the fluid come to the same positions" in search and "by Adam" in search
+    assert "Which gravity makes the fluid come to the same positions" in search and "uses Adam" in search
     assert described(capsys, "task.toml")["search"] == task_in_words(load_task("task.toml"))

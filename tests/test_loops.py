@@ -126,7 +126,7 @@ def test_bad_loops_are_refused_in_a_sentence(jax, simulation):
     layer = layer_of("jax")
     smoothed = layer.smoothed(simulation, partial(loop, layer, simulation), gradients.EnsembleMean(0.5))
     for use, sentence in (
-        (lambda: jax.jit(smoothed)({"g": np.zeros(2)}), "weights are traced .*, but must be arrays"),
+        (lambda: jax.jit(smoothed)({"g": np.zeros(2)}), "weights are JAX tracers, but must be arrays"),
         (lambda: smoothed({"initial_positions": np.zeros(2)}), "weights has initial_positions, but must have another"),
         (lambda: smoothed(np.zeros(2)), r"weights is .*, but must be .*\{'bias': array\}"),
         (lambda: smoothed.estimate({"g": ["a", "b"]}), "weight g is .*, but must be"),

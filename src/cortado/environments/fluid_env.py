@@ -184,7 +184,7 @@ class FluidEnv(gymnasium.Env[Observation, NDArray]):
         return seen[0], float(rewards[0]), bool(lost[0]), bool(truncated[0]), info
 
     def close(self) -> None:
-        """Close the environment. No episode can begin afterwards."""
+        """Close the environment. A closed environment begins no episode."""
         self._envs.close()
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -264,9 +264,9 @@ class FluidVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Begin all episodes, or only the episodes that a bool array (num_envs,) selects: ``options={"reset_mask":
-        mask}``. If ``seed`` is a number, environment b gets the seed ``seed + b``. With ``options={"state": state}``
-        the environments return to a saved state."""
+        """Begin all episodes. With ``options={"reset_mask": mask}``, begin only the episodes where the bool array
+        (num_envs,) is True. If ``seed`` is a number, environment b gets the seed ``seed + b``. With ``options={"state":
+        state}`` the environments return to a saved state."""
         self._require_open("reset")
         if (state := saved_option(options, seed, "reset_mask")) is not None:
             return self.restore(state), {}
@@ -335,7 +335,7 @@ class FluidVectorEnv(VectorEnv):
         return self.scenes.save(self._over, self._observations, random)
 
     def restore(self, state: EnvState) -> Observation:
-        """Go back to a saved state, and return its observations. The state must have the same number of environments.
+        """Go back to a saved state, and return its observations. The state must have as many environments as the batch.
         See `FluidEnv.restore`."""
         self._require_open("restore")
         self.scenes.restore(state)

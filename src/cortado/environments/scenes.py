@@ -35,7 +35,7 @@ LANES = 1
 """Number of threads per particle. A fixed number makes results bitwise equal for all batch sizes."""
 SEEN = 32
 MOST_PARTS = 16
-"""Greatest number of parts of a batch. A larger batch is not split. It uses all cores, but no graphs."""
+"""Greatest number of parts of a batch. A larger batch is computed whole, with all cores but without graphs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ class Start:
 class EnvState:
     """The saved state of an environment or a batch, returned by `save` and accepted by `restore`.
 
-    The saved state shares device arrays with the environment. No step overwrites these arrays. A pickled state contains
-    NumPy arrays instead.
+    The saved state shares device arrays with the environment. No step overwrites the arrays of a saved state. A pickled
+    state contains NumPy arrays.
     """
 
     kind: str
@@ -76,8 +76,8 @@ class EnvState:
 
     @WARP
     def __getitem__(self, numbers: int | Iterable[int]) -> "EnvState":
-        """Return the state of a batch that consists of the chosen scenes. Numbers may repeat: ``state[[0] * 8]`` is a
-        batch of eight copies of scene 0, with equal random generators."""
+        """Return the state of a batch that consists of the chosen scenes. A number may occur several times: ``state[[0]
+        * 8]`` is a batch of eight copies of scene 0, with equal random generators."""
         chosen = list(numbers) if isinstance(numbers, Iterable) else [numbers]
         if not chosen or any(not isinstance(b, (int, np.integer)) or not 0 <= b < len(self) for b in chosen):
             raise InputError(f"numbers are {shown(numbers)}, but must be scene numbers from 0 to {len(self) - 1}.")

@@ -95,7 +95,7 @@ class Task(ABC):
     """"small", for a CPU, or "large", for a GPU. The large size has `finer` times as many particles along each axis."""
     dimension: ClassVar[int] = 2
     finer: ClassVar[int] = 3
-    """Spacing of the small size divided by the spacing of the large size. The time steps have the same ratio."""
+    """Spacing and time step of the small size, divided by the spacing and time step of the large size."""
     name: ClassVar[str]
     horizon: ClassVar[int]
     """Number of environment steps before an episode is truncated."""

@@ -161,7 +161,7 @@ class Share(OverParticles):
 
 
 class Spread(OverParticles):
-    """A reward term: the mean distance ``|dx| + |dy|`` of pairs of chosen particles, divided by the constant
+    """A reward term: the mean distance ``|dx| + |dy|`` of pairs of chosen particles, divided by the reference distance
     ``everywhere``. Distances are between nearest periodic images."""
 
     kernel = "apart"
@@ -189,7 +189,7 @@ class Missed(OverParticles):
     kernel = "missed"
 
     def __init__(self, targets: NDArray, weights: NDArray):
-        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n). Index 0 is for step 1."""
+        """Set ``targets`` (steps, n, d) [m] and ``weights`` (steps, n). Index 0 belongs to step 1."""
         super().__init__(targets, weights)
         self._targets, self._weights = targets, weights
 

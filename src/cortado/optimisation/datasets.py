@@ -166,8 +166,8 @@ FIRST = ("initial_positions", "initial_velocities")
 FLUID, WALL, MOVING_WALL, BODY, MORE_FLUID, KINDS = 0, 1, 2, 3, 4, 9
 """Particle types of LagrangeBench. ``MORE_FLUID`` is the type of the second phase. ``KINDS`` is the number of types."""
 MARGIN = 3
-"""Distance from the container to the bounds of the data set [spacings]. LagrangeBench treats all axes as periodic if
-one axis is periodic. Opposite walls must therefore be far apart."""
+"""Distance from the container to the bounds of the data set [spacings]. If one axis is periodic, LagrangeBench treats
+all axes as periodic, so that opposite walls must be far apart."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def one_run(simulation: Simulation, sample: Sample) -> OneRun:
 
 
 def bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lower corner, lengths and periods of the bounds, each (d,) [m]. An axis without a period has 0."""
+    """Return lower corner, lengths and periods of the bounds, each (d,) [m]. Non-periodic axes have period 0."""
     ends, (_, periods) = scene.container.extent(), scene.periods
     if ends is None:
         raise InputError("container.shape is 'none', but must be 'box' or 'cylinder', as a data set has bounds.")
@@ -289,7 +289,7 @@ class DatasetFolder:
         self.out, self.parts = out, out / PARTS
 
     def save(self, number: int, run: OneRun) -> None:
-        """HDF5 may crash on a full disk. The run is therefore first written to memory."""
+        """Write a run to memory first, because HDF5 may crash on a full disk."""
         import h5py
 
         content = io.BytesIO()
@@ -390,7 +390,7 @@ class DatasetFolder:
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
         except RuntimeError as problem:  # so HDF5 says that the disk refused
-            said = f"{path} cannot be written, as the disk refuses"
+            said = f"{path} cannot be written to the disk"
             raise ComputationError(f"{said}; free some space, and repeat the command.") from problem
 
     def write_metadata(self, content: Mapping[str, Any]) -> None:

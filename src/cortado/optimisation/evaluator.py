@@ -23,7 +23,7 @@ from cortado.scene.parameter_values import Values
 Parameters = dict[str, Any]
 """Parameters by name. A value is a float if the initial value was a number, or else a float64 array."""
 GREATEST_GRADIENT = 1e150
-"""Greatest gradient component that counts as finite. Its square does not overflow."""
+"""Greatest gradient component that counts as finite. The square of this number does not overflow."""
 REFUSED = (DivergedError, InputError)
 """Errors that give a trial point an infinite loss."""
 WRONG = 10.0
@@ -31,7 +31,7 @@ WRONG = 10.0
 FELT = 0.01
 """Changes of the loss below this fraction of the range of all losses are negligible."""
 ROUND_OFF = 1e-5
-"""Round-off of a float32 loss, relative to the greatest loss. Smaller predicted changes are not tested."""
+"""Round-off of a float32 loss, relative to the greatest loss. Predicted changes below the round-off are not tested."""
 MISLED, FEW = 0.25, 2
 """Least fraction and least number of steps with wrong gradients in a search that counts as misled."""
 LEAST = 8
@@ -153,7 +153,7 @@ class Evaluator:
     left_out: int = 0
 
     def estimate(self, problem: Differentiable, parameters: Values, observe: Observer | None = None) -> Estimate:
-        """Estimate with an ensemble. Only the first estimate with failed runs gives a warning."""
+        """Estimate loss and gradient with an ensemble. Only the first estimate with failed runs gives a warning."""
         with warnings.catch_warnings():
             if self.left_out:
                 warnings.simplefilter("ignore", LeftOutWarning)
@@ -267,7 +267,7 @@ class Evaluator:
         wanted = dict(zip(self.layout.names, self.layout.shapes, strict=True))
         found = {name: np.shape(gradient) for name, gradient in gradients.items()}
         if found != wanted:
-            said = f"The problem gave gradients of shapes {found} for parameters of shapes {wanted}"
+            said = f"problem returned gradients of shapes {found} for parameters of shapes {wanted}"
             raise InputError(f"{said}; a gradient must have the names and the shapes of the parameters.")
         gradient = self.layout.ravel({n: as_numbers(f"The gradient of '{n}'", gradients[n]) for n in wanted})
         broken = ~(np.abs(gradient) <= GREATEST_GRADIENT)

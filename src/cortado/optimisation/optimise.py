@@ -69,7 +69,7 @@ class Result:
     evaluations: int
     """Number of evaluations in the history, including evaluations that were replayed from the checkpoint."""
     message: str
-    """Sentence on how the search ended."""
+    """Sentence on the end of the search."""
     converged: bool
     """True if the optimiser's convergence test was met and `misled` is false. Only L-BFGS has a convergence test."""
     refused: int = 0
@@ -78,7 +78,7 @@ class Result:
     left_out: int = 0
     """Number of failed runs that ensemble averages ignored. Replayed evaluations are not counted."""
     misled: bool = False
-    """True if the gradient disagreed with the change of the loss. Do not trust the search then; `message` gives advice.
+    """True if the gradient disagreed with the change of the loss. Do not trust such a search. `message` gives advice.
     Gradients are often wrong beyond the horizon of `cortado.certify`."""
     stays: bool = False
     """True if the lowest loss is still a large fraction of the first loss, as in a wrong local minimum."""
@@ -228,9 +228,9 @@ def optimise(
         settings: settings of a named optimiser, as in
             ``optimise(problem, start, "adam", learning_rate=0.1, iterations=50)``.
 
-    A step is refused if its run diverges or if a parameter is out of range. The optimiser then takes a shorter step.
-    After a refusal, Adam and gradient descent also shorten all later steps.
-    `Result.refused` counts refused steps, `Result.message` mentions them, and the checkpoint contains them.
+    A step is refused if its run diverges or if a parameter is out of range. After a refusal, the optimiser takes a
+    shorter step. Adam and gradient descent also shorten all later steps. `Result.refused` counts the refused steps.
+    `Result.message` and the checkpoint also contain the refused steps.
 
     Raises InputError for unsuitable ``start``, ``bounds`` or settings, and for a checkpoint of another run. Raises
     DivergedError if the run at the start diverges, or after a step was halved ten times. Raises ComputationError if a

@@ -73,7 +73,7 @@ class Adam:
 
     A step changes a component by at most about the learning rate, for gradients of any size. Every update ends with a
     projection onto the bounds. If the run after a step diverges, Adam halves the step and the learning rate, at most 10
-    times, and resets its two means to 0. Adam has no convergence test and makes all iterations.
+    times, and resets the two means to 0. Adam has no convergence test and makes all iterations.
 
     Source: D. P. Kingma and J. Ba, "Adam: a method for stochastic optimization", ICLR 2015, Algorithm 1. Raises
     InputError for settings out of range.
@@ -162,7 +162,7 @@ class LBFGS:
 
     L-BFGS finds accurate optima of smooth losses in few evaluations, but stops early if the gradient is noisy. The
     coordinates are (x - start) / scale for parameters x. The loss is divided by the greatest component of the first
-    gradient in these coordinates. So the first trial step is at most about `scale` long.
+    gradient in these coordinates. The first trial step is at most about `scale` long.
 
     With more than about 10^4 components the last bits of sums depend on the number of BLAS threads. Resume a large
     search with the same number of threads. A resumed run raises an error if its numbers differ from the logged numbers.

@@ -173,7 +173,7 @@ class Search:
     """The problem for an optimiser, as a function of one vector that contains all parameters."""
 
     evaluate: Callable[[Vector], tuple[float, Vector]]
-    """Function that maps a vector (size,) to the loss and the gradient (size,). It raises the error of a failed run."""
+    """Function that maps a vector (size,) to the loss and the gradient (size,). A failed run raises an error."""
     attempt: Callable[[Vector], tuple[float, Vector] | None]
     """Function that maps a vector (size,) to the loss and the gradient (size,), or to None for a failed run."""
     losses: Callable[[Sequence[Vector]], list[float]]
@@ -204,7 +204,7 @@ class Outcome:
     converged: bool
     """True if the optimiser's convergence test was met."""
     message: str
-    """Sentence on how the search ended."""
+    """Sentence on the end of the search."""
 
 
 @runtime_checkable

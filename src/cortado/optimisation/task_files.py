@@ -163,7 +163,7 @@ def _check_bounds(
 ) -> None:
     field = f"optimise.bounds.{name}"
     if name not in start:
-        raise SceneError(None, field, GIVEN, "left out, as it is not in optimise.start")
+        raise SceneError(None, field, GIVEN, "left out, as optimise.start has no such parameter")
     if name == "mass_fractions":
         raise SceneError(None, field, GIVEN, "left out, as a search keeps fractions from 0 to 1")
     value = start[name]
@@ -207,20 +207,20 @@ def task_in_words(task: Task) -> list[str]:
         wanted = f"look like the picture “{problem.picture}” {frames}"
     else:
         wanted = f"come to the same {compared} {frames} as a run whose {_listed(task.true_parameters)} the search "
-        wanted += "does not see"
+        wanted += "does not know"
     length = f"{counted(problem.steps, 'step')} ({seconds:.4g} s)" if problem.steps else "no steps"
     question = f"Which {_listed(task.start)} makes the fluid {wanted}? A run has {length}."
-    knots = f", by {settings.knots} knots in time" if settings.knots else ""
+    knots = f", with {settings.knots} knots in time" if settings.knots else ""
     algorithm = _ALGORITHMS.get(settings.optimiser, settings.optimiser.replace("_", " "))
     most, check = f"for {counted(settings.iterations, 'iteration')} at most{knots}", settings.check
-    how = f"The search goes by {algorithm} with a learning rate of {settings.learning_rate:g}, {most}."
+    how = f"The search uses {algorithm} with a learning rate of {settings.learning_rate:g}, {most}."
     words = {
         "loss_reduction": f"a loss {check.loss_reduction:g} times smaller than at the start",
-        "parameter_error": f"parameters within {100 * check.parameter_error:g}% of the hidden ones",
+        "parameter_error": f"parameters within {100 * check.parameter_error:g}% of the hidden parameters",
         "psnr": f"an image within {check.psnr:g} dB of the target",
     }
     asked = [sentence for name, sentence in words.items() if name in check.model_fields_set]
-    return [question, f"{how} It is asked for {_listed(asked)}." if asked else how]
+    return [question, f"{how} The task requires {_listed(asked)}." if asked else how]
 
 
 def _listed(words: Iterable[str]) -> str:

@@ -110,14 +110,14 @@ class VideoTable(MeasuredTable):
     kind: Literal["video"]
     """The measurements are frames of a video."""
     frame_rate: Annotated[float, quantity("1/s", gt=0.0)] | None = None
-    """Frames per second. The default is the frame rate of the video. A folder of pictures needs this key."""
+    """Frames per second. The default is the frame rate of the video. A folder of pictures needs a frame rate."""
     every: Annotated[int, count(1, 1_000_000)] = 1
-    """Use only every n-th frame."""
+    """Use only every n-th frame of the video."""
     crop: Annotated[tuple[Pixel, ...], components("left", "top", "right", "bottom")] | None = None
     """Part of each frame that is compared, as a rectangle in pixels. The default is the whole frame."""
     mask: Text | None = None
-    """Picture of the size of the frames. Black pixels are ignored. The path is relative to the folder of the task's
-    file."""
+    """Mask picture with the size of the frames. Black pixels are ignored. The path is relative to the folder of the
+    task's file."""
     calibrate: tuple[Literal["start", "translation", "rotation", "field_of_view", "width", "extinction"], ...] = ()
     """Additional quantities to fit: parameters of the camera, the extinction of the fluid, or "start" for the start
     time of the file."""
@@ -183,7 +183,7 @@ class ProblemTable(Table):
     """True parameters by name. The target is the result of a run with the true parameters. Give either target or
     picture."""
     picture: Text | None = None
-    """"heart", "rosetta", or a picture file, relative to the folder of the task's file."""
+    """Target picture: "heart", "rosetta", or a file with a path relative to the folder of the task's file."""
     measured: tuple[AnyMeasured, ...] = ()
     """Measurements of an experiment, which replace the target or picture in `cortado fit`."""
     also: tuple[Text, ...] = ()
@@ -248,8 +248,8 @@ class GradientTable(Table):
     samples: Annotated[int, count(1, 10_000)] = 1
     """Number of runs over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
-    """Width of the ensemble by parameter name, in the units of the searched values, knots or logarithms. This key is
-    needed with several samples. Samples may be out of bounds. Search positive parameters by their logarithm."""
+    """Width of the ensemble by parameter name, in the units of the searched values, knots or logarithms. Several
+    samples need this key. Samples may be out of bounds. Search positive parameters by their logarithm."""
     position_noise: Annotated[float, quantity("spacings", ge=0.0)] = EnsembleMean.position_noise
     """Standard deviation of the random displacements of initial positions in the ensemble."""
 

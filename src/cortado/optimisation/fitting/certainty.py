@@ -137,7 +137,7 @@ class FittedPart:
     part: Part
     weighting: Weighting
     residuals: np.ndarray
-    """Predicted minus measured numbers (frames, m), in the unit of the observation. Ignored numbers have 0."""
+    """Predicted minus measured numbers (frames, m), in the unit of the observation. Ignored numbers have residual 0."""
     spread: float
     samples: float
     frames: float

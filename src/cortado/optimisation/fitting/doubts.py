@@ -1,7 +1,7 @@
 """Sentences on possible errors of a fitted model, if the residuals do not look like noise.
 
 Possible errors are a trend, a late clock, a wrong density, or slipping walls. Each of these causes changes the
-predictions along a known direction. A fit with the parameters gives the size of each change and an error bar.
+predictions along a known direction. A fit that includes the changes gives the size of each change, with an error bar.
 """
 
 import warnings
@@ -22,7 +22,7 @@ from cortado.scene.parameter_values import Arrays
 TOO_LARGE_IN_MOTION = 2.0
 """Least ratio of the residuals of changing numbers to the residuals of constant numbers for a doubt."""
 EXACT = 1e-4
-"""Residuals below this fraction of the largest measured number are negligible."""
+"""Residuals below this fraction of the largest measured number count as zero."""
 
 
 def doubts_of(problem: LeastSquares, at: Linearised, weights: Weights, certainty: Certainty) -> tuple[str, ...]:

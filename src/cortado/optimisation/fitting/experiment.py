@@ -50,7 +50,7 @@ class Experiment:
             raise InputError("observations is empty, but must have at least one measurement.")
         for name, one in observations.items():
             if not hasattr(one, "measured"):
-                raise InputError(f"observations {name} is {shown(one)}, but must be such as a measured.Video.")
+                raise InputError(f"observations {name} is {shown(one)}, but must be an observation such as Video.")
             seen = getattr(getattr(one, "renderer", None), "inputs", {}).get("positions", simulation.positions.shape)
             if seen != simulation.positions.shape:
                 found = f"renders positions {seen}, but the simulation has positions {simulation.positions.shape}"

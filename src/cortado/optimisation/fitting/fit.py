@@ -40,7 +40,7 @@ class Profile:
     deviance: np.ndarray
     """Sum of squares minus its minimum (points,), in squared standard errors."""
     expected: np.ndarray
-    """Deviance of the linear model (points,). Confidence intervals are based on this model."""
+    """Deviance of the linear model (points,), from which confidence intervals are computed."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ class Fit:
     parts: tuple[FittedPart, ...] = field(repr=False)
     """Residuals of each observation and their statistics."""
     doubts: tuple[str, ...] = field(repr=False)
-    """Sentences on residuals that do not look like noise. The model then has errors above the error bars."""
+    """Sentences on residuals that do not look like noise, and so show model errors above the error bars."""
     converged: bool = True
-    """True if the search ended at a minimum of the sum of squares, and False if it made all its iterations before."""
+    """True if the search ended at a minimum of the sum of squares, and False if the search used up its iterations."""
     tried: tuple[Tried, ...] = field(default=(), repr=False)
     """Starts and ends of all searches, including the search of this fit."""
     runs: int = 0
@@ -125,7 +125,7 @@ class Fit:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Return the covariance of the fitted numbers (free, free), in their units. It is valid for small errors."""
+        """Return the covariance of the fitted numbers (free, free), in their units, valid for small errors."""
         slopes = self.coordinates.slopes(self.u)
         return self.coordinate_covariance * np.outer(slopes, slopes)
 
@@ -189,9 +189,9 @@ class Fit:
         parameters. Raises `InputError` for a wrong shape, or if the fit was loaded from a pickle.
 
         The result is minus half of the weighted sum of squares, relative to the minimum. If noise is correlated, the
-        sum of squares gives too short error bars. Distances from the estimate are therefore multiplied by a matrix W
-        with W^T N W = V^-1, where V is the covariance of the estimate, and N the Hessian of the sum of squares. The
-        method is the curvature adjustment of Ribatet, Cooley and Davison (2012).
+        sum of squares alone gives too short error bars. Distances from the estimate are therefore multiplied by a
+        matrix W with W^T N W = V^-1, where V is the covariance of the estimate, and N the Hessian of the sum of
+        squares. The method is the curvature adjustment of Ribatet, Cooley and Davison (2012).
         """
         point = as_numbers("u", u)
         if point.shape != self.u.shape:
@@ -255,7 +255,7 @@ def _plain(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a value and its standard error. An error from 1 to 3 has two digits, others one."""
+    """Format a value and its standard error. Errors that begin with 1 to 3 have two digits, and other errors one."""
     if not np.isfinite(error) or error <= 0.0:
         return f"{value:.6g} ± {error:.2g}"
     power = int(np.floor(np.log10(error)))

@@ -29,7 +29,7 @@ class Searched:
     at: Linearised
     """Last point, with an estimated Jacobian."""
     next: np.ndarray
-    """Next trial point (free,), without a simulation."""
+    """Next trial point (free,). No simulation was run at this point."""
     gain: float
     converged: bool
 

@@ -124,14 +124,14 @@ class Coordinates:
         return found
 
     def spread(self, free: np.ndarray, otherwise: float | np.ndarray) -> Arrays:
-        """Convert fitted components (free,) to arrays by name. All other components are ``otherwise``."""
+        """Convert fitted components (free,) to arrays by name. Fixed components are set to ``otherwise``."""
         whole = np.full(len(self.at_start), otherwise)
         whole[self.free] = free
         return self.named(whole)
 
 
 def whitened(values: np.ndarray, times: np.ndarray, correlation_time: float) -> np.ndarray:
-    """Make frames of ``values`` (frames, ...) uncorrelated. The standard deviation does not change."""
+    """Make frames of ``values`` (frames, ...) uncorrelated, without a change of their standard deviation."""
     if not correlation_time:
         return values
     kept = np.exp(-np.diff(times) / correlation_time).reshape(-1, *[1] * (values.ndim - 1))
@@ -270,7 +270,7 @@ class TrialPoints:
         self._points.append(u)
         self._residuals.append(residuals)
         self.are_many = len(self._points) >= 5 * (len(u) + 1)
-        """True if the points need too much memory. The search should then start again."""
+        """True if the points need too much memory, so that the search should start again."""
         return len(self._points) - 1
 
     def linearised(self, number: int) -> Linearised:

@@ -105,11 +105,11 @@ class Frames:
         return {int(k) + more for k in self.steps for more in (0, 1)}
 
     def rates(self, read: Mapping[int, np.ndarray], time_step: float) -> np.ndarray:
-        """Return time derivatives of readings (frames, ...), per second. ``read`` is by step number."""
+        """Return time derivatives of readings (frames, ...), per second. ``read`` has readings by step number."""
         return np.array([(read[int(k) + 1] - read[int(k)]) / time_step for k in self.steps])
 
     def between(self, read: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return readings interpolated to the frames (frames, ...). ``read`` is by step number."""
+        """Return readings interpolated to the frames (frames, ...). ``read`` has readings by step number."""
         last = max(read)
         after = [read[min(int(k) + int(share > 0.0), last)] for k, share in zip(self.steps, self.shares, strict=True)]
         before = np.array([read[int(k)] for k in self.steps])
@@ -118,7 +118,7 @@ class Frames:
 
 
 def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict[str, np.ndarray]:
-    """Return the parameter "start" if ``calibrate`` contains this name. ``alone`` forbids other names."""
+    """Return the parameter "start" if ``calibrate`` contains "start". If ``alone`` is true, other names are refused."""
     for name in calibrate if alone else ():
         if name != CLOCK:
             raise InputError(f'calibrate has {shown(name)}, but must be empty or ["{CLOCK}"].')
@@ -126,7 +126,7 @@ def clock_of(calibrate: Sequence[str], start: float, alone: bool = True) -> dict
 
 
 def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Check an observation. Return its times plus ``clock`` [s], its measured values, and its noise."""
+    """Check and return the times plus ``clock`` [s], the measured values, and the noise of an observation."""
     late = as_one_number("clock", clock)
     if not np.isfinite(late):
         raise InputError(f"clock is {late:g}, but must be a finite number of seconds.")
@@ -152,7 +152,7 @@ def checked(times: Any, measured: Any, noise: Any, clock: Any = 0.0) -> tuple[np
 
 @fixed
 class Video:
-    """A video as an observation of a fit. Its frames are compared with pictures of the simulation.
+    """A video as an observation of a fit. The frames of the video are compared with pictures of the simulation.
 
     Example: ``video = cortado.measured.Video(simulation.renderer(resolution=(64, 64)), times, frames)``
     """

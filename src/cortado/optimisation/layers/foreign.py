@@ -64,9 +64,9 @@ class Packing:
         self._kept: dict[tuple[int, ...], tuple[list[Any], list[Any]]] = {}
 
     def at(self, addresses: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any]]:
-        """Return the flat arrays at the addresses of buffers, and the views of the arrays by `cut`. The arrays are
-        NumPy arrays if ``device`` is None, and Warp arrays otherwise. Results are cached, because programs use the same
-        few buffers again."""
+        """Return flat arrays at the addresses of buffers, and the views that `cut` makes. The arrays are NumPy arrays
+        if ``device`` is None, and Warp arrays otherwise. Results are cached, because programs use the same few buffers
+        again."""
         return kept_or_made(self._kept, addresses, lambda _: self._made(addresses, device), KEPT)
 
     def _made(self, addresses: tuple[int, ...], device: Any) -> tuple[list[Any], list[Any]]:

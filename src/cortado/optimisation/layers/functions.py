@@ -47,7 +47,7 @@ LOSS, READING, PICTURE = "loss", "reading", "picture"
 
 
 class LayerParameters:
-    """A converter of the parameter arrays of a layer to parameters of a simulation, and of adjoints back to arrays.
+    """A converter of the arrays of a layer to parameters of a simulation, and of adjoints back to arrays.
 
     If ``each`` is True, each scene of the batch is one evaluation of the layer, and the first axis of every array
     numbers the evaluations. If ``each`` is False, a parameter may have any shape that `docs/batches.md` allows.
@@ -62,7 +62,7 @@ class LayerParameters:
         for name, shape in part(given, PARAMETER).items():
             shapes = self._space.shapes(name)
             if with_state and name in self._simulation.known.state:
-                raise InputError(f"parameter {name} is given, but must be left out: the state has its own.")
+                raise InputError(f"parameter {name} is given, but must be left out: the state contains {name}.")
             if shape not in shapes:
                 raise InputError(f"parameter {name} has shape {shape}, but must be {' or '.join(map(str, shapes))}.")
 
@@ -187,8 +187,8 @@ class Evaluation:
         return self._found
 
     def along(self, dots: Named) -> Any:
-        """Return the derivative of the loss along the tangents ``dots``. Without a gradient estimator, forward mode is
-        used."""
+        """Return the derivative of the loss along the tangents ``dots``. Forward mode is used without a gradient
+        estimator."""
         if isinstance(self._estimator, Exact) and not self._with_state and self._found is None:
             return self._problem.tangent(self.values, part(dots, PARAMETER))
         terms = [self.gradient[name] * dot for name, dot in dots.items()]
@@ -245,7 +245,7 @@ class Value(OfSimulation):
         return {LOSS: np.where(self._moved(dots), found, 0.0)}
 
     def _moved(self, dots: Named) -> Any:
-        """Return True for scenes with a non-zero tangent. The shape is () or (batch,)."""
+        """Return a mask () or (batch,) of the scenes with a non-zero tangent."""
         found = np.zeros(self.outputs()[LOSS], dtype=bool)
         for name, dot in dots.items():
             array = on_host(dot)

@@ -49,7 +49,7 @@ class Layer(ABC):
     on_device: frozenset[str] = frozenset()
     kept_bytes: int = 0
     unmapped: str = ""
-    """Name of the layer in the error message of `many`. Empty if `many` is available."""
+    """Name of the layer in the error message of `many`. The name is empty if `many` is available."""
 
     def __init__(self) -> None:
         self._batched: dict[int, Layer] = {}

@@ -49,8 +49,8 @@ class Bridge(ABC):
 
     @abstractmethod
     def mapped(self, loss: Callable[[Any, Any], Any], slope: bool) -> Callable[[Any, Any], tuple[Any, Any]]:
-        """Return a function of k sets of weights and initial positions, stacked along a first axis. It returns the
-        losses (k,). If ``slope`` is true, the function also returns the gradients by name.
+        """Return a function of k sets of weights and initial positions, stacked along a first axis. The function
+        returns the losses (k,). If ``slope`` is true, the function also returns the gradients by name.
         """
 
     @abstractmethod

@@ -261,7 +261,7 @@ class JaxBridge(Bridge):
 
         def forward(given: Any) -> tuple[Any, Any]:
             if any(isinstance(array, jax.core.Tracer) for array in given.values()):
-                raise InputError("weights are traced by jax.jit or jax.vmap, but must be arrays: do not map the loss.")
+                raise InputError("weights are JAX tracers, but must be arrays: call the loss without jit and vmap.")
             value, gradient = found(given)
             return jnp.asarray(value), {name: jnp.asarray(gradient[name], own.dtype) for name, own in given.items()}
 
