@@ -361,7 +361,6 @@ class FluidVectorEnv(VectorEnv):
 
 
 def saved_option(options: Any, seed: Any, *others: str) -> EnvState | None:
-    """Return the saved state in the options of a reset, or None."""
     require_table("options", options or {}, "{'state': state}")
     found, known = options or {}, ("state", *others)
     for name in found:

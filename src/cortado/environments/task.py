@@ -177,7 +177,6 @@ def checked_scene(task: Task) -> Scene:
 
 
 def checked_actions(what: str, given: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return actions clipped to the range from -1 to 1."""
     array = as_numbers(what, given)
     if array.shape != shape:
         raise InputError(f"{what} has shape {array.shape}, but must be {shape}.")

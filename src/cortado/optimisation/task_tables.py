@@ -134,7 +134,7 @@ class SensorSeriesTable(MeasuredTable):
     sensor: Text
     """Name of the [[sensor]] in the scene."""
     calibrate: Clock = ()
-    """The value ["start"] adds the start time of the file to the fitted quantities."""
+    """Use ["start"] to fit also the start time of the file."""
     noise: Annotated[float, quantity(gt=0.0)] | None = None
     """Standard deviation of a reading, in its unit. The default is an estimate from the residuals."""
 
@@ -146,7 +146,7 @@ class TracksTable(MeasuredTable):
     kind: Literal["tracks"]
     """The measurements are paths of tracers, which move with the fluid."""
     calibrate: Clock = ()
-    """The value ["start"] adds the start time of the file to the fitted quantities."""
+    """Use ["start"] to fit also the start time of the file."""
     noise: Annotated[float, quantity("m", gt=0.0)] | None = None
     """Standard deviation of a coordinate [m]. The default is an estimate from the residuals."""
 
@@ -176,14 +176,14 @@ class ProblemTable(Table):
     """Data that are compared with the target: positions of particles, or images."""
     distance: Annotated[str, OneOf(DISTANCES)] = "squared_difference"
     """Distance between images: the squared difference, or an image pyramid. A pyramid suits shapes that do not overlap
-    at the start of the search."""
+    at the start."""
     frames: Annotated[int, count(1, 10_000)] = 1
     """Number of compared states. The states are evenly spaced in time up to the last state."""
     target: Values | None = None
     """True parameters by name. The target is the result of a run with the true parameters. Give either target or
     picture."""
     picture: Text | None = None
-    """Target picture: "heart", "rosetta", or a file with a path relative to the folder of the task's file."""
+    """Target picture: "heart", "rosetta", or a file relative to the folder of the task's file."""
     measured: tuple[AnyMeasured, ...] = ()
     """Measurements of an experiment, which replace the target or picture in `cortado fit`."""
     also: tuple[Text, ...] = ()
@@ -222,7 +222,6 @@ class ProblemTable(Table):
 
     @property
     def compared(self) -> list[int]:
-        """Return the step numbers of the states that are compared."""
         return [round(self.steps * (k + 1) / self.frames) for k in range(self.frames)]
 
 
@@ -243,8 +242,8 @@ class GradientTable(Table):
     name: Annotated[str, OneOf(ESTIMATORS)] = "exact"
     """Name of the estimator. "adjoint_viscosity" suits long splashes."""
     coefficient: Annotated[float, quantity(ge=0.0)] | None = None
-    """Coefficient C of `AdjointViscosity`; by default 2. The coefficient multiplies the strain in a time step to give
-    the strength of the viscosity."""
+    """Coefficient of `AdjointViscosity`, by default 2. The strength of the viscosity is the coefficient times the
+    strain in a step."""
     samples: Annotated[int, count(1, 10_000)] = 1
     """Number of runs over which the gradient is averaged: 1, or an even number of at least 4."""
     spread: Values | None = None
@@ -278,7 +277,6 @@ class GradientTable(Table):
         return self
 
     def estimator(self, executor: Executor | None = None) -> GradientEstimator:
-        """``executor`` computes the samples of an ensemble."""
         one = ESTIMATORS[self.name]
         if isinstance(one, AdjointViscosity):
             coefficient = one.coefficient if self.coefficient is None else self.coefficient
@@ -348,7 +346,7 @@ class FitTable(Table):
     """Lower and upper bound by parameter name. A value with equal bounds is not fitted."""
     iterations: Annotated[int, count(1, 10_000)] = 50
     """Greatest number of trial points of each of the two fits. The first fit gives all residuals equal weights. The
-    weights of the second fit come from the noise in the residuals of the first fit."""
+    second fit uses weights from the residuals of the first fit."""
     starts: Annotated[int, count(1, 100)] | None = None
     """Number of starts of the fit. By default the fit has one start. If the result is doubtful, three further starts
     follow. Further starts lie within the bounds. Without bounds, positive parameters vary by a factor of up to 100."""

@@ -88,7 +88,6 @@ class Layer(ABC):
         return OneByOne(self, size)
 
     def batched(self, size: int) -> "Layer":
-        """Return the cached result of `many`."""
         self.check_mapped()
         return kept_or_made(self._batched, size, self.many, KEPT)
 
@@ -204,7 +203,6 @@ def stacked(found: Iterable[Named]) -> dict[str, Array]:
 
 
 def copied(found: Named) -> Named:
-    """Return a copy of a dictionary in which all Warp arrays are copied."""
     return {name: wp.clone(array) if isinstance(array, wp.array) else array for name, array in found.items()}
 
 

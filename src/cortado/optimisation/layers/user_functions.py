@@ -369,7 +369,6 @@ class LoopPass:
         return self._losses
 
     def back(self, estimator: AdjointEstimator, observe: Observer | None = None) -> Arrays:
-        """Run the closed loops a second time, and return the gradients (k, ...) by name."""
         self._losses, gradient = self._loop.at(self._points, estimator, slope=True)
         return gradient
 
