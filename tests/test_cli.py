@@ -258,7 +258,11 @@ def test_what_came_out_is_told_before_it_is_drawn(cortado_command, monkeypatch, 
     [
         ({"misled": True}, [], "The gradient disagrees with what steps of the search did. Over 20 steps the exact"),
         ({"misled": True}, ["optimise.gradient.name=adjoint_viscosity"], "search did: set optimise.optimiser = "),
-        ({"stays": True}, [], "If the search is in a wrong valley, try another start, fewer steps, or set optimise."),
+        (
+            {"stays": True},
+            [],
+            "If the search is in a wrong local minimum, try another start, fewer steps, or set opt",
+        ),
         ({}, [], None),
     ],
 )

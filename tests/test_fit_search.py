@@ -148,7 +148,7 @@ def rough(u):
     return 0.03 * u * TIMES + 0.001 * np.sin(90.0 * u + 3.0 * TIMES)
 
 
-def test_a_start_in_a_wrong_valley_is_left_and_a_good_one_costs_no_more():
+def test_a_start_in_a_wrong_local_minimum_is_left_and_a_good_one_costs_no_more():
     made = Formula(behind_a_wall, 2.0)
     alone = cortado.fit(made, {"viscosity": 0.1}, starts=1)
     assert alone.in_doubt and alone.values["viscosity"] < 0.5 and "in doubt" in repr(alone)
@@ -159,7 +159,7 @@ def test_a_start_in_a_wrong_valley_is_left_and_a_good_one_costs_no_more():
     assert len(near.tried) == 1 and near.runs <= 8 and near.u == pytest.approx(found.u, abs=0.01)
 
 
-def test_valleys_that_are_as_deep_are_a_doubt():
+def test_minima_that_are_as_deep_are_a_doubt():
     found = cortado.fit(Formula(even, 3.0), {"viscosity": 2.0}, starts=4)
     assert len(found.tried) == 4
     (doubt,) = found.doubts
@@ -325,7 +325,7 @@ def test_a_video_is_upright_as_players_show_it(tmp_path, matrix, shown):
 def test_what_proportions_leave_out_is_said(tmp_path):
     for k in range(4):
         write_picture(tmp_path / f"{k}.png", np.full((20, 25, 3), 0.5))
-    with pytest.warns(CortadoWarning, match=r"frames of .* have 25 x 20 pixels, but 16 x 16 .* 80% of it") as caught:
+    with pytest.warns(CortadoWarning, match=r"frames of .* have 25 x 20 pixels, but 16 x 16 .* 80% of") as caught:
         read_frames(tmp_path, (16, 16), frame_rate=10.0)
     assert len(caught) == 1
 

@@ -196,20 +196,20 @@ def test_a_search_beyond_its_horizon_names_the_certificate_and_the_pair():
 
 
 @pytest.mark.parametrize("optimiser", MANY, ids=lambda one: type(one).__name__)
-def test_a_loss_that_stays_may_be_in_a_wrong_valley(optimiser):
-    def valleys(parameters):
+def test_a_loss_that_stays_may_be_in_a_wrong_local_minimum(optimiser):
+    def double_well(parameters):
         x = parameters["x"]
         return (x**2 - 1.0) ** 2 + 0.2 * (x + 1.0), {"x": 4.0 * x * (x**2 - 1.0) + 0.2}
 
-    wrong, right = (optimise(valleys, {"x": x}, optimiser, 60) for x in (1.4, -1.5))
+    wrong, right = (optimise(double_well, {"x": x}, optimiser, 60) for x in (1.4, -1.5))
     assert wrong.stays and "maybe in a wrong local minimum. Try another start" in wrong.message
     assert ("LineSearch" in wrong.message) is not isinstance(optimiser, LineSearch)
-    assert not right.stays and "valley" not in right.message
+    assert not right.stays and "local minimum" not in right.message
 
 
 @pytest.mark.parametrize("optimiser", MANY, ids=lambda one: type(one).__name__)
 def test_a_search_that_ends_at_its_bound_names_the_bound(optimiser):
-    """And no valley; one that only began there, or that bounds do not hold, says nothing of bounds."""
+    """And no local minimum; one that only began there, or that bounds do not hold, says nothing of bounds."""
 
     def far(parameters):
         x, y = parameters["x"], parameters["y"]
@@ -218,7 +218,7 @@ def test_a_search_that_ends_at_its_bound_names_the_bound(optimiser):
     bounds = {"x": (-1.0, 1.0), "y": (0.0, 5.0)}
     held = optimise(far, {"x": np.zeros(2), "y": 4.0}, optimiser, 60, bounds=bounds)
     assert "x is at a bound, and the loss falls further beyond: widen" in held.message
-    assert not held.stays and "valley" not in held.message
+    assert not held.stays and "local minimum" not in held.message
     free = optimise(far, {"x": np.full(2, -1.0), "y": 4.0}, optimiser, 60, bounds={**bounds, "x": (-1.0, 20.0)})
     assert "bound" not in free.message
 

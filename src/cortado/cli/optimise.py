@@ -74,7 +74,7 @@ def judge(
 
 def found_in_words(error: float) -> str:
     if error > MOST_ERROR:
-        why = "the search is too short, it ended in a wrong valley of the loss, or other values do as well"
+        why = "the search is too short, it ended in a wrong local minimum of the loss, or other values do as well"
         return f"not found, {100 * error:.3g}% off: {why}"
     return f"found with an error of {100 * error:.2g}%"
 
@@ -154,7 +154,7 @@ class Solved:
             found.append(f"The loss hardly fell: try an optimise.learning_rate that is 10 times as {other}.")
         elif result.stays or max(self.verdict.errors.values(), default=0.0) > MOST_ERROR:
             more = ", fewer steps" + (" or more frames" if made.renderer else "")
-            found.append(f"If the search is in a wrong valley, try another start{more}, or set {search}.")
+            found.append(f"If the search is in a wrong local minimum, try another start{more}, or set {search}.")
         return found
 
     def _at_knots(self, name: str) -> Iterator[tuple[str, Any, Any, Any]]:

@@ -172,8 +172,8 @@ PARAMETERS = (
     Parameter(
         "tilt",
         "°",
-        "angle by which the scene's gravity is turned, in the place of gravity; its size stays. Gravity along -y turns "
-        "towards x by the first number and, in 3-D, towards z by the second",
+        "angles by which gravity turns, at constant strength, instead of `gravity`. The first angle turns gravity along"
+        " -y towards x; in 3-D, the second angle turns gravity towards z",
         Axis.STEP,
         lambda s: np.zeros(s.scene.dimension - 1),
         components=lambda dimension, phases: dimension - 1,
@@ -184,13 +184,19 @@ PARAMETERS = (
         absent="has no gravity to lean",
     ),
     _of_particles(
-        "initial_positions", "m", "where particles are at the start", lambda s: s.positions, change=spacing_of
+        "initial_positions", "m", "positions of particles at the start", lambda s: s.positions, change=spacing_of
     ),
-    _of_particles("initial_velocities", "m/s", "how fast they are", lambda s: s.velocities, change=_speed_of_fall),
+    _of_particles(
+        "initial_velocities",
+        "m/s",
+        "velocities of particles at the start",
+        lambda s: s.velocities,
+        change=_speed_of_fall,
+    ),
     _of_particles(
         "mass_fractions",
         "",
-        "what they are made of at the start, where there are several phases",
+        "shares of the phases in the mass of each particle at the start",
         lambda s: s.mass_fractions,
         components=lambda dimension, phases: phases,
         range=Range.FRACTIONS,

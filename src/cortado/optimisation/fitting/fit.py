@@ -342,7 +342,7 @@ def fit(
             if starts is None and not (found.in_doubt and elsewhere(found, tried)):
                 break  # a fit without doubts, or all have the same end
         spent = replace(found, runs=problem.runs, tangents=problem.tangents, refused=problem.refused)
-        found = replace(spent, tried=tuple(tried), doubts=(*found.doubts, *other_valleys(found, tried)))
+        found = replace(spent, tried=tuple(tried), doubts=(*found.doubts, *other_minima(found, tried)))
     if not found.doubts:
         return found
     assert found.at is not None
@@ -388,7 +388,7 @@ def elsewhere(found: Fit, tried: Sequence[Tried]) -> list[Tried]:
     return sorted(others, key=lambda one: one.misfit)
 
 
-def other_valleys(found: Fit, tried: Sequence[Tried]) -> list[str]:
+def other_minima(found: Fit, tried: Sequence[Tried]) -> list[str]:
     """Return a sentence on the second-lowest local minimum, if it is nearly as likely as the fit."""
     others, bars = elsewhere(found, tried), np.sqrt(np.diag(found.coordinate_covariance))
     if not others:
