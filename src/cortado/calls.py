@@ -122,7 +122,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return kind is str and isinstance(value, str)
     if kind is Callable and inner and isinstance(inner[0], list):
         return _takes(value, len(inner[0]))
-    if kind is tuple and inner and inner[-1] is not ...:
+    if kind is tuple and isinstance(value, tuple) and inner and inner[-1] is not ...:
         return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
     if inner and isinstance(value, Mapping):
         return all(_fits(one, inner[-1]) for one in value.values())

@@ -45,7 +45,8 @@ Panel = Callable[[int, Around], Points]
 """A function that draws a frame as a linear picture (rows, columns, 3) from 0 to 1."""
 LEAST_PIXELS = 64
 SLOW = 0.1
-"""Speed of a film [simulated seconds per second]. Slower films do not average fluid at rest over frames."""
+"""Speed of a film [simulated seconds per second]. In films at this speed or faster, fluid at rest is an average over
+frames."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """Viscous friction between fluid and a free body without slip, from each particle's sums over the walls of the body.
 
 Like other walls without slip (`cortado.sph.stress_forces`), the body acts as a neighbour at the surface point below
-particle i. The surface point moves with the body. The vector y_b leads to particle i from the surface at wall particle
-b, which has the weight s_b. The vector r leads to particle i from the body's middle c'. The surface point is at c' + r
-- y_b and has the velocity V + W x (r - y_b), with the body's velocity V and angular velocity W. The effect of the body
-on particle i follows from three sums over wall particles,
+particle i. The surface point moves with the body. Wall particle b has the weight s_b and an own estimate of the surface
+point. The vector y_b goes from this point to particle i, and r from the body's middle c'. The surface point is at
+c' + r - y_b and has the velocity V + W x (r - y_b), with the body's velocity V and angular velocity W. The effect of
+the body on particle i follows from three sums over wall particles,
 
     H = sum_b s_b,   Y = sum_b s_b y_b,   N = sum_b s_b y_b y_b^T,
 
