@@ -386,7 +386,7 @@ def test_no_more_processes_than_items(monkeypatch):
             pass
     assert started == [(1, "cuda"), (3, "cuda"), (1, "cuda")]
     with pytest.raises(
-        InputError, match=r"^--workers is 65, but must be at most 64, as this machine has 2 cores: more"
+        InputError, match=r"^--workers is 65, but must be at most 64, as this machine has 2 cores; more"
     ):
         Where(workers=65)
 

@@ -297,7 +297,7 @@ def test_a_clock_that_is_late_is_doubted_where_it_is_not_searched(clocked, simul
     tracks = measured.Tracks(simulation, first, times, np.zeros((9, *first.shape)))
     late = measured.Experiment(simulation, {"tracers": tracks}).measured_again({"tracers": moved})
     found = cortado.fit(with_noise(late, 1e-4), {"viscosity": 1.5}, starts=1)
-    assert any('clock right? calibrate = ["start"]' in one for one in found.doubts)
+    assert any('clock right? Fit the clock by calibrate = ["start"]' in one for one in found.doubts)
 
 
 def test_an_estimate_at_its_bound_is_doubted(shaken):
